@@ -38,7 +38,7 @@ def writable_directory(path: Path) -> Path:
 
 
 def checkpoint_identity(checkpoint: Path) -> dict[str, str]:
-    """`name` and `sha256` of a checkpoint.
+    """``name`` and ``sha256`` of a checkpoint.
 
     The hash covers the tensors and what decides how they are used: config, tokenizer and statistics, where
     there are such files.

@@ -22,7 +22,7 @@ from saccade._internal.flags import (
 from saccade.errors import InputError
 from saccade_lab.sim.tasks import TASKS
 
-#: The flags that `add_frames` declares besides `--frames`.
+#: The flags that ``add_frames`` declares besides ``--frames``.
 WITH_FRAMES = (
     *("instruction", "state", "precision", "embodiment", "preprocessing", "tokenizer"),
     *("other_frames", "other_instruction"),  # of `saccade study patching`
@@ -30,7 +30,7 @@ WITH_FRAMES = (
 
 
 def add_tasks(parser: Arguments, help: str = "tasks to run (default: all that the policy knows)") -> None:
-    """Declares the names of tasks; see `check_tasks`."""
+    """Declares the names of tasks; see ``check_tasks``."""
     add_list(parser, "--tasks", help=help)
 
 
@@ -40,7 +40,7 @@ def add_episodes(parser: Arguments, default: int | None, help: str = "episodes p
 
 
 def add_frames(parser: argparse.ArgumentParser) -> None:
-    """Declares pictures and words for a whole checkpoint; see `check_frames`."""
+    """Declares pictures and words for a whole checkpoint; see ``check_frames``."""
     seen = parser.add_argument_group("pictures and words for a whole checkpoint")
     add_pictures(seen, "--frames")
     seen.add_argument(
@@ -50,14 +50,14 @@ def add_frames(parser: argparse.ArgumentParser) -> None:
 
 
 def check_frames(args: argparse.Namespace, *refused: str) -> None:
-    """Checks the flags of `add_frames`.
+    """Checks the flags of ``add_frames``.
 
     Args:
         args: Parsed arguments.
-        refused: Names of arguments that cannot be combined with `--frames`: they are None where not given.
+        refused: Names of arguments that cannot be combined with ``--frames``: they are None where not given.
 
     Raises:
-        UsageError: One needs `--frames`, or cannot be combined with it.
+        UsageError: One needs ``--frames``, or cannot be combined with it.
     """
     wrong, rule = (WITH_FRAMES, "only with") if args.frames is None else (refused, "not with")
     given = [name for name in wrong if getattr(args, name, None) is not None]
@@ -71,8 +71,8 @@ def add_rollout_arguments(parser: Arguments, episodes: int) -> None:
 
     Args:
         parser: Parser of the study.
-        episodes: Default number per task. It is kept as `args.default_episodes`, and `args.episodes` is None
-            where the flag is absent, because with `--features` the flag may not be given.
+        episodes: Default number per task. It is kept as ``args.default_episodes``, and ``args.episodes`` is
+            None where the flag is absent, because with ``--features`` the flag may not be given.
     """
     add_checkpoint(
         parser, "policy to study (default: the bundled policy); with --features any checkpoint of a head"
@@ -101,7 +101,7 @@ def known_tasks() -> tuple[str, ...]:
 
 
 def indices(flag: str, given: Iterable[int] | None, count: int) -> tuple[int, ...]:
-    """Distinct indices below `count` in increasing order; None gives all of them.
+    """Distinct indices below ``count`` in increasing order; None gives all of them.
 
     Raises:
         InputError: One is out of range.

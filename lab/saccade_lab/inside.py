@@ -21,7 +21,7 @@ from saccade.policy.reading import Observations, read_observations
 
 @dataclass(frozen=True, eq=False)
 class Parts:
-    """The parts of a policy that `saccade.Policy.from_pretrained` loaded."""
+    """The parts of a policy that ``saccade.Policy.from_pretrained`` loaded."""
 
     head: saccade.ActionHead
     backbone: saccade.Backbone
@@ -29,7 +29,7 @@ class Parts:
 
 
 def parts_of(policy: saccade.Policy) -> Parts:
-    """The parts of a policy that `saccade.Policy.from_pretrained` loaded.
+    """The parts of a policy that ``saccade.Policy.from_pretrained`` loaded.
 
     Raises:
         InputError: It has no backbone or no processor, or they or its head are not saccade's own.
@@ -48,7 +48,7 @@ def inputs_of(policy: saccade.Policy, observation: Observations) -> list[Backbon
     """The backbone's inputs for each row of observations: resized frames and token ids.
 
     Raises:
-        InputError, ShapeError, DtypeError: as `saccade.Policy.encode`.
+        InputError, ShapeError, DtypeError: As ``saccade.Policy.encode``.
     """
     if policy.processor is None:
         raise InputError(f"policy: expected one with a processor, got {policy!r}")
@@ -58,14 +58,14 @@ def inputs_of(policy: saccade.Policy, observation: Observations) -> list[Backbon
 def features_of(
     policy: saccade.Policy, inputs: Sequence[BackboneInputs], *, previous: PolicyContext | None = None
 ) -> tuple[BackboneFeatures, ...]:
-    """The backbone's features for each of its inputs; `previous` as in `saccade.Policy.encode`."""
+    """The backbone's features for each of its inputs; ``previous`` as in ``saccade.Policy.encode``."""
     if policy.backbone is None:
         raise InputError(f"policy: expected one with a backbone, got {policy!r}")
     return compute_features(inputs, policy.backbone, previous)
 
 
 def context_of(policy: saccade.Policy, features: Sequence[BackboneFeatures]) -> PolicyContext:
-    """What the head encodes of features of any lengths, as `features_of` returns them."""
+    """What the head encodes of features of any lengths, as ``features_of`` returns them."""
     return encode_features(features, policy.head)
 
 
@@ -73,9 +73,9 @@ def head_inputs(policy: saccade.Policy, seen: Mapping[str, Any], features: Backb
     """The inputs of a policy's head for one observation, without noise.
 
     Args:
-        policy: the policy.
-        seen: the observation, in a format of `saccade.Policy.encode`.
-        features: the backbone's features of it, a batch of one.
+        policy: The policy.
+        seen: The observation, in a format of ``saccade.Policy.encode``.
+        features: The backbone's features of it, a batch of one.
     """
     state = read(seen, policy.requirements).state
     reads_mask = policy.head.config.mask_mode == "alternate"

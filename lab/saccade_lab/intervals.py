@@ -13,7 +13,7 @@ def wilson(successes: int, trials: int) -> tuple[float, float]:
     """Wilson's 95 % score interval of a success rate; 0 to 1 without trials.
 
     Raises:
-        InputError: `successes` is negative or larger than `trials`.
+        InputError: ``successes`` is negative or larger than ``trials``.
 
     Example:
         >>> [round(bound, 3) for bound in wilson(18, 20)]

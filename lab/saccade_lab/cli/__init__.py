@@ -1,1 +1,1 @@
-"""The commands of the lab, found by `saccade` through the entry points `saccade.commands`."""
+"""The commands of the lab, found by ``saccade`` through the entry points ``saccade.commands``."""

@@ -1,4 +1,4 @@
-"""`saccade attention`: shows what the rows of the action head attend to, as a sheet, a page and numbers."""
+"""``saccade attention``: shows what the rows of the action head attend to, as a sheet, a page and numbers."""
 
 from __future__ import annotations
 
@@ -117,7 +117,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def head(word: str) -> int | str:
-    """An item of `--heads`."""
+    """An item of ``--heads``."""
     return word if word == "mean" else int(word)
 
 
@@ -192,7 +192,7 @@ def maps_of(args: argparse.Namespace, checkpoint: dict[str, str], head: ActionHe
 
 
 def check(args: argparse.Namespace) -> None:
-    """Raises `UsageError` or `InputError` for arguments that are wrong whatever the checkpoint is."""
+    """Raises ``UsageError`` or ``InputError`` for arguments that are wrong whatever the checkpoint is."""
     if args.out.exists() and not args.out.is_dir():
         raise UsageError(f"--out: {args.out} is not a directory")
     if args.heads is not None and "mean" in args.heads and len(args.heads) > 1:

@@ -1,4 +1,4 @@
-"""`saccade demos`: records scripted experts through the policy's cameras."""
+"""``saccade demos``: records scripted experts through the policy's cameras."""
 
 from __future__ import annotations
 

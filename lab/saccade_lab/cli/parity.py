@@ -1,4 +1,4 @@
-"""`saccade parity`: compares the Rust head with the torch reference in float64, on every instruction set."""
+"""``saccade parity``: the Rust head against the torch reference in float64, on every instruction set."""
 
 from __future__ import annotations
 
@@ -247,7 +247,7 @@ def engines(
 
 
 def run_reference(source: Path, inputs: HeadInputs, num_steps: int | None, dtype: str) -> Outputs:
-    """`vl_embs` and actions of the reference. Its weights are freed when this returns."""
+    """``vl_embs`` and actions of the reference. Its weights are freed when this returns."""
     import torch
 
     from saccade_lab.reference import ActionHead
@@ -271,7 +271,7 @@ def run_reference(source: Path, inputs: HeadInputs, num_steps: int | None, dtype
 
 
 def run_rust(source: Path, inputs: HeadInputs, args: argparse.Namespace, isa: str) -> Outputs:
-    """`vl_embs` and actions of the Rust head on one instruction set."""
+    """``vl_embs`` and actions of the Rust head on one instruction set."""
     from saccade_lab.reference import loading
 
     with forced_isa(isa):
@@ -288,7 +288,7 @@ def run_rust(source: Path, inputs: HeadInputs, args: argparse.Namespace, isa: st
 
 @contextmanager
 def forced_isa(isa: str) -> Iterator[None]:
-    """Sets `SACCADE_ISA`, which is read when a head is built, and restores it at the end."""
+    """Sets ``SACCADE_ISA``, which is read when a head is built, and restores it at the end."""
     before = os.environ.get("SACCADE_ISA")
     os.environ["SACCADE_ISA"] = isa
     try:

@@ -1,4 +1,4 @@
-"""`saccade rollout`: runs a policy on camera images in closed loop; writes a result file and videos."""
+"""``saccade rollout``: runs a policy on camera images in closed loop; writes a result file and videos."""
 
 from __future__ import annotations
 

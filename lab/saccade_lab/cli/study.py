@@ -1,4 +1,4 @@
-"""`saccade study`: measures what the parts of an action head contribute, and reports it with intervals."""
+"""``saccade study``: measures what the parts of an action head contribute, and reports it with intervals."""
 
 from __future__ import annotations
 
@@ -96,7 +96,7 @@ def compute(kind: type[Study], args: argparse.Namespace) -> Path:
 
     Args:
         kind: The study.
-        args: As its `add_arguments` and `add_common_arguments` declare them.
+        args: As its ``add_arguments`` and ``add_common_arguments`` declare them.
 
     Returns:
         The directory of the table.

@@ -1,4 +1,4 @@
-"""`saccade train`: trains the policy on recorded demonstrations."""
+"""``saccade train``: trains the policy on recorded demonstrations."""
 
 from __future__ import annotations
 

@@ -67,7 +67,7 @@ class Token:
 
     Attributes:
         position: Position in T_vl.
-        kind: One of `OTHER_KINDS`. Special tokens (brackets around pictures, registers, turns of a chat)
+        kind: One of ``OTHER_KINDS``. Special tokens (brackets around pictures, registers, turns of a chat)
             are often attention sinks, so their mass is reported separately.
         name: Its text.
     """
@@ -79,10 +79,10 @@ class Token:
 
 @dataclass(frozen=True)
 class Layout:
-    """What is at each of the `num_tokens` positions of T_vl.
+    """What is at each of the ``num_tokens`` positions of T_vl.
 
     Raises:
-        ShapeError: a position is described twice or not at all, or two cameras have one name.
+        ShapeError: A position is described twice or not at all, or two cameras have one name.
 
     Example:
         >>> layout = parse_layout("text:2,image:2x2=left,special:1=</img>,pad:*", num_tokens=9)
@@ -129,7 +129,7 @@ class Layout:
         return parts
 
     def kinds(self) -> dict[str, npt.NDArray[np.int64]]:
-        """As `parts`, with the patches of all cameras under `"image"`."""
+        """As ``parts``, with the patches of all cameras under ``"image"``."""
         parts = self.parts()
         image = [parts.pop(camera.name) for camera in self.cameras]
         return ({"image": np.concatenate(image)} if image else {}) | parts
@@ -144,10 +144,10 @@ class Layout:
 
 
 def parse_grid(text: str) -> tuple[int, int]:
-    """`"16x16"` to rows and columns; a single number is the patches of a square picture.
+    """``"16x16"`` to rows and columns; a single number is the patches of a square picture.
 
     Raises:
-        InputError: it is neither.
+        InputError: It is neither.
 
     Example:
         >>> parse_grid("3x4"), parse_grid("256")
@@ -164,7 +164,7 @@ def parse_grid(text: str) -> tuple[int, int]:
 
 
 def square(patches: int, what: str) -> tuple[int, int]:
-    """The square grid with that number of patches; raises `InputError` if there is none."""
+    """The square grid with that number of patches; raises ``InputError`` if there is none."""
     side = math.isqrt(patches)
     if side * side != patches:
         raise InputError(f"{what}: {patches} image tokens are not a square; give the grid as ROWSxCOLUMNS")
@@ -174,19 +174,20 @@ def square(patches: int, what: str) -> tuple[int, int]:
 def parse_layout(text: str, num_tokens: int, names: Sequence[str] | None = None) -> Layout:
     """Reads a layout written by hand.
 
-    The grammar: parts in the order of their positions, separated by commas. A part is `KIND:SIZE` or
-    `KIND:SIZE=NAME`. KIND is `image`, `text`, `special` or `pad`. SIZE is `ROWSxCOLUMNS` or a square number
-    for `image` (one camera), the number of tokens for the others; one of those may have `*`, for all
-    remaining positions. NAME is the name of the camera or of the tokens (numbered if there are several).
+    The grammar: parts in the order of their positions, separated by commas. A part is ``KIND:SIZE`` or
+    ``KIND:SIZE=NAME``. KIND is ``image``, ``text``, ``special`` or ``pad``. SIZE is ``ROWSxCOLUMNS`` or a
+    square number for ``image`` (one camera), the number of tokens for the others; one of those may have
+    ``*``, for all remaining positions. NAME is the name of the camera or of the tokens (numbered if there are
+    several).
 
     Args:
-        text: the layout, for instance `"text:14,image:16x16=left,special:1=</img>,text:*"`.
+        text: The layout, for instance ``"text:14,image:16x16=left,special:1=</img>,text:*"``.
         num_tokens: T_vl.
-        names: names of all tokens. Default: generated.
+        names: Names of all tokens. Default: generated.
 
     Raises:
-        InputError: the text does not follow the grammar.
-        ShapeError: it describes another number of tokens.
+        InputError: The text does not follow the grammar.
+        ShapeError: It describes another number of tokens.
     """
     parts = [_parse_part(part) for part in text.split(",")]
     open_parts = [part for part in parts if part[1] is None]
@@ -218,7 +219,7 @@ def parse_layout(text: str, num_tokens: int, names: Sequence[str] | None = None)
 
 
 def _parse_part(part: str) -> tuple[str, tuple[int, int] | None, str | None]:
-    """Kind, grid (`(1, size)` for what is not an image, None for `*`) and name."""
+    """Kind, grid (``(1, size)`` for what is not an image, None for ``*``) and name."""
     found = re.fullmatch(r"\s*(\w+)\s*:\s*([\dx*]+)\s*(?:=\s*(.+?)\s*)?", part)
     if found is None:
         raise InputError(f"layout: {part!r} cannot be read, expected {GRAMMAR}")
@@ -242,17 +243,17 @@ def from_input_ids(
     names: Sequence[str] | None = None,
     attention_mask: npt.NDArray[np.bool_] | None = None,
 ) -> Layout:
-    """The layout of a prompt: each run of image tokens is split into pictures of `grid`.
+    """The layout of a prompt: each run of image tokens is split into pictures of ``grid``.
 
     Args:
-        input_ids: `(T_vl,)`.
-        image_token_index: id of the token that stands for one patch.
-        grid: rows and columns of a picture.
-        names: strings of all tokens; default: their ids.
-        attention_mask: `(T_vl,)`, False at padding; default: a leading run of `PADDING_ID` is padding.
+        input_ids: ``(T_vl,)``.
+        image_token_index: Id of the token that stands for one patch.
+        grid: Rows and columns of a picture.
+        names: Strings of all tokens; default: their ids.
+        attention_mask: ``(T_vl,)``, False at padding; default: a leading run of ``PADDING_ID`` is padding.
 
     Raises:
-        InputError: there is no image token, or a run does not split into pictures.
+        InputError: There is no image token, or a run does not split into pictures.
     """
     padding = (
         np.logical_and.accumulate(input_ids == PADDING_ID) if attention_mask is None else ~attention_mask
@@ -280,16 +281,16 @@ def from_image_mask(
     names: Sequence[str] | None = None,
     attention_mask: npt.NDArray[np.bool_] | None = None,
 ) -> Layout:
-    """The layout given by the image mask of a `Context`.
+    """The layout given by the image mask of a ``Context``.
 
     Args:
-        image_mask: `(T_vl,)`, True at image tokens.
-        grid: rows and columns of a picture; default: each run of image tokens is one square picture.
-        names: strings of all tokens; those in angle brackets count as special.
-        attention_mask: `(T_vl,)`, False at padding.
+        image_mask: ``(T_vl,)``, True at image tokens.
+        grid: Rows and columns of a picture; default: each run of image tokens is one square picture.
+        names: Strings of all tokens; those in angle brackets count as special.
+        attention_mask: ``(T_vl,)``, False at padding.
 
     Raises:
-        InputError: there is no image token, or a run does not split into pictures.
+        InputError: There is no image token, or a run does not split into pictures.
     """
     length = len(image_mask)
     padding = np.zeros(length, dtype=np.bool_) if attention_mask is None else ~attention_mask

@@ -41,7 +41,7 @@ class Occluder(Protocol):
     batch: int  # places at once
 
     def __call__(self, head: ActionHead, places: Sequence[Place | None]) -> Float32Array:
-        """One chunk for each place, `(places, horizon, action_dim)`, normalised; None removes nothing."""
+        """One chunk for each place, ``(places, horizon, action_dim)``, normalised; None removes nothing."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class Occlusion:
     Attributes:
         method: How patches were removed.
         cell: Patches along each side of what was removed at once.
-        change: Mean |change| of the normalised actions by camera, `(rows, columns)`, from equal noise.
+        change: Mean |change| of the normalised actions by camera, ``(rows, columns)``, from equal noise.
         other_noise: Mean |change| between chunks of the whole observation from different noise, to compare.
     """
 
@@ -88,7 +88,7 @@ class BlankedFrames:
         self._observation = observation
 
     def __call__(self, head: ActionHead, places: Sequence[Place | None]) -> Float32Array:
-        """See `Occluder`."""
+        """See ``Occluder``."""
         encoded = self._policy.encode([self._without(place) for place in places], previous=self._encoded)
         return self._observation.repeated(len(places)).sample(head, encoded.context)
 
@@ -125,10 +125,10 @@ def behind(place: Place, height: int, width: int) -> tuple[slice, slice]:
 
 
 class DroppedPositions:
-    """Removes patches from T_vl: `drop_vl` removes their positions, as if they had not been there.
+    """Removes patches from T_vl: ``drop_vl`` removes their positions, as if they had not been there.
 
     Args:
-        observation: one row, with noise.
+        observation: One row, with noise.
     """
 
     method = (
@@ -141,7 +141,7 @@ class DroppedPositions:
         self._observation = observation
 
     def __call__(self, head: ActionHead, places: Sequence[Place | None]) -> Float32Array:
-        """See `Occluder`."""
+        """See ``Occluder``."""
         repeated = self._observation.repeated(len(places))
         dropped = np.zeros((len(places), repeated.num_vl_tokens), dtype=np.bool_)
         for row, place in zip(dropped, places, strict=True):
@@ -157,10 +157,10 @@ def cell_for(layout: Layout, cell: int | None) -> int:
     Args:
         layout: Layout with the cameras.
         cell: The number given by the user; None chooses the smallest with which no picture has more than
-            `MAX_CELLS` x `MAX_CELLS` cells.
+            ``MAX_CELLS`` x ``MAX_CELLS`` cells.
 
     Raises:
-        InputError: it is below 1.
+        InputError: It is below 1.
     """
     if cell is not None:
         if cell < 1:
@@ -196,13 +196,13 @@ def measure(
     """Removes every patch of every camera in turn.
 
     Args:
-        head: head that computes the chunks.
-        layout: where the patches are.
-        occluder: function that removes them.
-        whole: function from a number of draws to chunks of the whole observation, `(draws, horizon,
+        head: Head that computes the chunks.
+        layout: Where the patches are.
+        occluder: Function that removes them.
+        whole: Function from a number of draws to chunks of the whole observation, `(draws, horizon,
             action_dim)`.
-        cell: patches along each side of what is removed at once.
-        on_done: called with the number of places done.
+        cell: Patches along each side of what is removed at once.
+        on_done: Called with the number of places done.
     """
     places, batch = places_of(layout, cell), occluder.batch
     untouched = occluder(head, [None])[0]

@@ -85,7 +85,7 @@ def page_data(maps: Maps) -> dict[str, Any]:
 
 
 def _shown(maps: Maps, attention: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
-    """The mean over the chosen heads, then those that are shown one by one, `(1 + shown, rows, keys)`."""
+    """The mean over the chosen heads, then those that are shown one by one, ``(1 + shown, rows, keys)``."""
     places = [maps.selection.heads.index(head) for head in maps.selection.shown_heads]
     return np.concatenate((attention.mean(axis=0, keepdims=True), attention[places]))
 

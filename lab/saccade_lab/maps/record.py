@@ -21,7 +21,7 @@ from saccade_lab.maps.summary import Overlap, overlap, summarize
 from saccade_lab.maps.view import View
 
 Indices = npt.NDArray[np.int64]
-#: The maps of one Euler step and block, `(heads, rows, keys)`.
+#: The maps of one Euler step and block, ``(heads, rows, keys)``.
 Attention = Mapping[tuple[int, int], Float32Array]
 
 CAVEAT = (
@@ -59,7 +59,7 @@ class Maps:
         view: The observation.
         selection: Which maps.
         rows: Slices of the groups; a group without rows is left out.
-        attention: Maps by step and block, `(heads, rows, keys)`, with the heads in the selection's order.
+        attention: Maps by step and block, ``(heads, rows, keys)``, with the heads in the selection's order.
         redrawn: Maps of the future rows with random future tokens; None without future tokens.
         occlusion: None if there are no image tokens.
     """
@@ -96,7 +96,7 @@ class Maps:
         return [block for block in self.selection.blocks if not self.reads_vl(block)]
 
     def mean(self, block: int, step: int | None = None) -> Float32Array:
-        """The mean over heads, and over steps unless one is given, `(rows, keys)`."""
+        """The mean over heads, and over steps unless one is given, ``(rows, keys)``."""
         steps = self.selection.steps if step is None else (step,)
         mean: Float32Array = np.mean(
             [self.attention[one, block].mean(axis=0) for one in steps], axis=0, dtype=np.float32
@@ -108,7 +108,7 @@ class Maps:
         return self.view.layout.parts() if self.reads_vl(block) else self._row_parts()
 
     def agreement(self, keys: Float32Array) -> float | None:
-        """Spearman's rank correlation over all patches between a map `(T_vl,)` and the occlusion map.
+        """Spearman's rank correlation over all patches between a map ``(T_vl,)`` and the occlusion map.
 
         None without image tokens, or if one of the two maps is constant.
         """
@@ -122,7 +122,7 @@ class Maps:
         return float(np.corrcoef(rankdata(read), rankdata(change))[0, 1])
 
     def agreements(self) -> list[dict[str, Any]]:
-        """`agreement` of the mean map of each group over heads and Euler steps, in cross-attention blocks."""
+        """``agreement`` of each group's mean map over heads and Euler steps, in cross-attention blocks."""
         return [
             {
                 "block": block,
@@ -140,8 +140,9 @@ class Maps:
     def summaries(self) -> list[dict[str, Any]]:
         """One entry for each step, block, group and head, the mean map of all heads first.
 
-        The entry of the mean map has `per_head`: entropy and overlap of the maps of each head, averaged over
-        the heads. If heads attend to different keys, the mean map is wide although each head's is narrow.
+        The entry of the mean map has ``per_head``: entropy and overlap of the maps of each head, averaged
+        over the heads. If heads attend to different keys, the mean map is wide although each head's is
+        narrow.
         """
         rng = np.random.default_rng(0)
         entries = []
@@ -174,7 +175,7 @@ class Maps:
         return entries
 
     def to_dict(self) -> dict[str, Any]:
-        """`attention.json`."""
+        """``attention.json``."""
         return {
             "saccade": saccade.__version__,
             "checkpoint": self.checkpoint,
@@ -251,7 +252,7 @@ def _trace(
 
 
 def random_tokens(learned: Float32Array, seed: int) -> Float32Array:
-    """Random directions with the lengths of the learned future tokens; both `(N, width)`."""
+    """Random directions with the lengths of the learned future tokens; both ``(N, width)``."""
     drawn = np.random.default_rng(seed).standard_normal(learned.shape, dtype=np.float32)
     lengths = np.linalg.norm(learned, axis=-1, keepdims=True)
     random: Float32Array = drawn * (lengths / np.linalg.norm(drawn, axis=-1, keepdims=True))

@@ -51,7 +51,7 @@ class Sheet:
     """Draws the sections from top to bottom. Sections that do not apply are left out; the header says why.
 
     Args:
-        maps: what to draw.
+        maps: What to draw.
     """
 
     def __init__(self, maps: Maps) -> None:
@@ -379,7 +379,7 @@ class Sheet:
         self._note("Below the axes: the block and what it reads. Lines join blocks that read the same keys.")
 
     def _on_cameras(self, keys: Float32Array) -> dict[str, Float32Array]:
-        """A row's map `(T_vl,)` by camera, `(rows, columns)` each."""
+        """A row's map ``(T_vl,)`` by camera, ``(rows, columns)`` each."""
         return {
             camera.name: keys[camera.positions].reshape(camera.rows, camera.columns)
             for camera in self.cameras
@@ -391,7 +391,7 @@ class Sheet:
         return camera.columns / camera.rows if picture is None else picture.shape[1] / picture.shape[0]
 
     def _height_for(self, wide: float, strips: int, highest: float) -> float:
-        """Height of pictures at which `strips` strips of all cameras fit next to each other."""
+        """Height of pictures at which ``strips`` strips of all cameras fit next to each other."""
         aspects = sum(self._aspect(camera) for camera in self.cameras)
         gaps = GAP * (len(self.cameras) - 1) * strips
         return min(highest, (wide - gaps) / (aspects * strips))

@@ -50,8 +50,8 @@ class GroupSummary:
         mass: Share of attention by part of the keys, mean over the rows.
         entropy: Entropy of the rows' maps.
         overlap: Between the rows' maps; None with fewer than two.
-        shuffled: Overlap after each map was shuffled separately, see `shuffle`: the overlap of unrelated maps
-            with the same entropies.
+        shuffled: Overlap after each map was shuffled separately, see ``shuffle``: the overlap of unrelated
+            maps with the same entropies.
     """
 
     tokens: int
@@ -75,7 +75,7 @@ def entropy(maps: FloatArray) -> npt.NDArray[np.float64]:
 
 
 def overlap(maps: FloatArray) -> Overlap | None:
-    """Overlap of maps `(tokens, keys)`; None with fewer than two."""
+    """Overlap of maps ``(tokens, keys)``; None with fewer than two."""
     p = np.asarray(maps, dtype=np.float64)
     tokens = len(p)
     if tokens < 2:
@@ -98,7 +98,7 @@ def overlap(maps: FloatArray) -> Overlap | None:
 
 
 def shuffle(maps: FloatArray, parts: Mapping[str, Indices], rng: np.random.Generator) -> FloatArray:
-    """Shuffles each map `(tokens, keys)` by itself, within each part of the keys.
+    """Shuffles each map ``(tokens, keys)`` by itself, within each part of the keys.
 
     Every token keeps its mass on each part and its entropy; the keys that it attends to become unrelated to
     those of the others.
@@ -115,13 +115,13 @@ def summarize(
     shuffled_within: Mapping[str, Indices],
     rng: np.random.Generator,
 ) -> GroupSummary:
-    """Summarises the maps `(tokens, keys)` of one group; at least one token.
+    """Summarises the maps ``(tokens, keys)`` of one group; at least one token.
 
     Args:
-        maps: probabilities.
-        parts: the keys by what they are, for `mass`.
-        shuffled_within: the parts within which keys are shuffled.
-        rng: generator for the shuffling.
+        maps: Probabilities.
+        parts: The keys by what they are, for ``mass``.
+        shuffled_within: The parts within which keys are shuffled.
+        rng: Generator for the shuffling.
     """
     entropies = entropy(maps)
     mean = np.asarray(maps, dtype=np.float64).mean(axis=0)

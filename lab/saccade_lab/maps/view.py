@@ -37,7 +37,7 @@ class View:
         source: Description of the observation for JSON.
         observation: One row, with noise.
         layout: What the positions of T_vl are.
-        images: Images by camera name, `(H, W, 3)`; empty if there are none.
+        images: Images by camera name, ``(H, W, 3)``; empty if there are none.
         occluder: Function that removes patches.
     """
 
@@ -54,7 +54,7 @@ class LayoutOptions:
     """How to find the image tokens in a file of features.
 
     Attributes:
-        text: A layout written by hand, see `layout.parse_layout`; it overrides what the file says.
+        text: A layout written by hand, see ``layout.parse_layout``; it overrides what the file says.
         grid: Rows and columns of a picture.
         image_token_index: The id of the token that stands for one patch.
     """
@@ -68,7 +68,7 @@ def from_simulator(policy: SimulatorPolicy, task: str, seed: int, control_steps:
     """What the policy sees after a number of control steps of a rollout, with the noise of that rollout.
 
     Raises:
-        InputError: the episode ends before that.
+        InputError: The episode ends before that.
     """
     from saccade_lab.sim.rollout import environment_for
     from saccade_lab.sim.tasks import TASKS
@@ -145,16 +145,16 @@ def from_file(path: Path, config: HeadConfig, *, row: int, options: LayoutOption
     """One observation of a file of backbone features.
 
     Args:
-        path: `.npz` or `.safetensors`, see `saccade.head.input_files.read_arrays`.
-        config: config of the head that will take them.
-        row: which of the observations of the file.
-        options: where its image tokens are.
-        seed: seed of the noise, if the file contains none.
+        path: ``.npz`` or ``.safetensors``, see ``saccade.head.input_files.read_arrays``.
+        config: Config of the head that will take them.
+        row: Which of the observations of the file.
+        options: Where its image tokens are.
+        seed: Seed of the noise, if the file contains none.
 
     Raises:
-        FileNotFoundError: there is no such file.
-        InputError: arrays are missing or not finite, or nothing says where the image tokens are.
-        ShapeError: sizes that do not fit the head or each other.
+        FileNotFoundError: There is no such file.
+        InputError: Arrays are missing or not finite, or nothing says where the image tokens are.
+        ShapeError: Sizes that do not fit the head or each other.
     """
     arrays = read_arrays(path)
     # Heads that ignore padding show it: there these masks say what the positions are, and nothing else.
@@ -167,7 +167,7 @@ def from_file(path: Path, config: HeadConfig, *, row: int, options: LayoutOption
         raise InputError(f"--row: given {row}, {path} has rows 0 to {batch - 1}")
 
     def of_row(name: str, shape: tuple[int, ...]) -> npt.NDArray[Any] | None:
-        """The row of an array `(batch, *shape)`; -1 is any size. One row may leave out the batch axis."""
+        """The row of an array ``(batch, *shape)``; -1 is any size. One row may leave out the batch axis."""
         if name not in arrays:
             return None
         array = np.asarray(arrays[name])

@@ -11,8 +11,8 @@ def add_arguments(parser: argparse.ArgumentParser, items: str) -> None:
     """Declares where a command runs.
 
     Args:
-        parser: parser of the command.
-        items: what is computed at the same time, in the plural.
+        parser: Parser of the command.
+        items: What is computed at the same time, in the plural.
     """
     group = parser.add_argument_group("several processes")
     group.add_argument(
@@ -36,14 +36,14 @@ def add_arguments(parser: argparse.ArgumentParser, items: str) -> None:
 
 
 def workers_of(args: argparse.Namespace, num_threads: int | None = None) -> Workers:
-    """The processes, from the flags of `add_arguments`.
+    """The processes, from the flags of ``add_arguments``.
 
     Args:
-        args: the parsed arguments.
-        num_threads: threads of one item; None for 1.
+        args: The parsed arguments.
+        num_threads: Threads of one item; None for 1.
 
     Raises:
-        InputError: as `Workers`.
+        InputError: As ``Workers``.
     """
     jobs = args.jobs
     if jobs is None:

@@ -32,8 +32,8 @@ class Job:
     """What all items of a run share. It is sent to each process once.
 
     Attributes:
-        work: See `saccade_lab.parallel.each`.
-        shipments: Files and directories, by the absolute paths that `work` has for them.
+        work: See ``saccade_lab.parallel.each``.
+        shipments: Files and directories, by the absolute paths that ``work`` has for them.
         version: The saccade that sends it.
     """
 
@@ -48,11 +48,11 @@ def each(
     workers: Workers,
     files: Sequence[str | Path],
 ) -> Iterator[tuple[Item, Result | Lost]]:
-    """As `saccade_lab.parallel.each`.
+    """As ``saccade_lab.parallel.each``.
 
     Files are put into Ray's object store here; each machine fetches them when its first item begins. Ray's
-    `runtime_env` cannot bring them: it is one message of at most 512 MiB. Ray repeats an item whose process,
-    machine or result was lost.
+    ``runtime_env`` cannot bring them: it is one message of at most 512 MiB. Ray repeats an item whose
+    process, machine or result was lost.
     """
     LAB.require("ray")
     with connected(workers.address) as ray:
@@ -91,8 +91,8 @@ def received(reference: Any) -> Callable[[Any], Any]:
     """The work with the paths of this machine. It is kept for the next item.
 
     Raises:
-        InputError: this machine has another version of saccade.
-        OSError: files cannot be written.
+        InputError: This machine has another version of saccade.
+        OSError: Files cannot be written.
     """
     import ray
 
@@ -112,7 +112,7 @@ def connected(address: str | None) -> Iterator[ModuleType]:
     """Ray, connected to a cluster; disconnected at the end, unless it was connected before.
 
     Raises:
-        InputError: there is no cluster at the address.
+        InputError: There is no cluster at the address.
     """
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # a cluster that is started here reports to nobody
     # Otherwise an item that runs out of memory is repeated without limit. Read when this process connects.
@@ -137,14 +137,14 @@ def connected(address: str | None) -> Iterator[ModuleType]:
 
 
 def check_reachable(address: str | None) -> None:
-    """Raises `OSError` if nothing listens at `HOST:PORT`, of which Ray would say so after minutes."""
+    """Raises ``OSError`` if nothing listens at ``HOST:PORT``, of which Ray would say so after minutes."""
     host, _, port = (address or "").removeprefix("ray://").rpartition(":")
     if host and port.isdecimal():
         socket.create_connection((host.strip("[]"), int(port)), SECONDS_TO_CONNECT).close()
 
 
 def check_cluster(ray: ModuleType, workers: Workers) -> None:
-    """Raises `InputError` if no machine has the cores of one item: Ray would wait for one forever."""
+    """Raises ``InputError`` if no machine has the cores of one item: Ray would wait for one forever."""
     cores = [node["Resources"].get("CPU", 0) for node in ray.nodes() if node["Alive"]]
     if max(cores, default=0) < workers.num_threads:
         raise InputError(
@@ -165,11 +165,11 @@ def most_at_once(ray: ModuleType, workers: Workers) -> int:
 
 
 def result_of(ray: ModuleType, reference: Any) -> Any:
-    """The result of an item, or `Lost` if its processes died again and again.
+    """The result of an item, or ``Lost`` if its processes died again and again.
 
     Raises:
         ClusterError: Ray cannot go on.
-        Exception: what the work raised.
+        Exception: What the work raised.
     """
     gone = ray.exceptions
     try:

@@ -28,8 +28,8 @@ class Shipment:
     Attributes:
         name: Its name, which it keeps there.
         sha256: Hash of names and contents.
-        files: For each file, by its path below the directory that contains `name`, what `put` returned for
-            each of its chunks.
+        files: For each file, by its path below the directory that contains ``name``, what ``put`` returned
+            for each of its chunks.
     """
 
     name: str
@@ -40,7 +40,7 @@ class Shipment:
 def files_of(path: Path) -> dict[str, Path]:
     """The files of a shipment, by their paths below the directory that contains it.
 
-    Hidden files are left out. A `.safetensors` file takes `config.json` with it, if that is next to it.
+    Hidden files are left out. A ``.safetensors`` file takes ``config.json`` with it, if that is next to it.
     """
     if path.is_dir():
         return {f"{path.resolve().name}/{file.relative_to(path).as_posix()}": file for file in walked(path)}
@@ -63,7 +63,7 @@ def walked(directory: Path) -> list[Path]:
 
 
 def pack(path: Path, put: Callable[[UInt8Array], Any]) -> Shipment:
-    """Reads a file or directory and hands its bytes to `put`, in chunks of at most `CHUNK_BYTES`."""
+    """Reads a file or directory and hands its bytes to ``put``, in chunks of at most ``CHUNK_BYTES``."""
     digest, files = hashlib.sha256(), {}
     for name, file in files_of(path).items():
         size = file.stat().st_size
@@ -85,11 +85,11 @@ def place(shipment: Shipment, get: Callable[[Any], UInt8Array]) -> Path:
     dies leaves a temporary directory, which the next one removes.
 
     Args:
-        shipment: what `pack` returned.
-        get: the bytes of a chunk.
+        shipment: What ``pack`` returned.
+        get: The bytes of a chunk.
 
     Raises:
-        OSError: it cannot be written, or what arrived is not what was packed.
+        OSError: It cannot be written, or what arrived is not what was packed.
     """
     cache = cache_directory()
     folder = cache / shipment.sha256
@@ -130,12 +130,12 @@ def _unpack(shipment: Shipment, get: Callable[[Any], UInt8Array], folder: Path) 
 
 
 def cache_directory() -> Path:
-    """The directory of this machine that keeps shipments: `saccade-UID` where temporary files are.
+    """The directory of this machine that keeps shipments: ``saccade-UID`` where temporary files are.
 
-    It may be deleted when nothing runs. `TMPDIR` puts it elsewhere.
+    It may be deleted when nothing runs. ``TMPDIR`` puts it elsewhere.
 
     Raises:
-        PermissionError: it belongs to someone else.
+        PermissionError: It belongs to someone else.
     """
     path = Path(tempfile.gettempdir()) / f"saccade-{os.getuid()}"
     path.mkdir(mode=0o700, parents=True, exist_ok=True)
@@ -147,12 +147,12 @@ def cache_directory() -> Path:
 def located(work: Any, files: Iterable[str | Path]) -> tuple[dict[str, Path], Any]:
     """The files to bring, by absolute paths, and the work with these paths in place of its own.
 
-    A path may be relative, contain `..` or lead through links; it means what it means here. Files that do not
-    exist, for example because they are names of published checkpoints, are left as they are.
+    A path may be relative, contain ``..`` or lead through links; it means what it means here. Files that do
+    not exist, for example because they are names of published checkpoints, are left as they are.
 
     Args:
-        work: As `relocated` takes values. A string is a path if it contains a separator (see
-            `saccade._internal.files.path_text`); a word may be equal to the name of a file.
+        work: As ``relocated`` takes values. A string is a path if it contains a separator (see
+            ``saccade._internal.files.path_text``); a word may be equal to the name of a file.
         files: Files and directories, each named in any way.
     """
     sources = {str(path): path for path in (_absolute(file) for file in files if Path(file).exists())}
@@ -180,10 +180,10 @@ def relocated(work: Any, places: Mapping[str, Path]) -> Any:
 
 
 def _absolute(path: str | Path) -> Path:
-    """An absolute path without `..` and links, except that a link to a file keeps its own name.
+    """An absolute path without ``..`` and links, except that a link to a file keeps its own name.
 
-    A file's name tells its type, and the files next to it belong to it; in the cache of `huggingface_hub` it
-    is a link to a file without either.
+    A file's name tells its type, and the files next to it belong to it; in the cache of ``huggingface_hub``
+    it is a link to a file without either.
     """
     path = Path(path)
     try:
@@ -193,11 +193,11 @@ def _absolute(path: str | Path) -> Path:
 
 
 def _replaced(value: Any, replace: Callable[[str, bool], str]) -> Any:
-    """A value in which `replace` was applied to strings and paths; the value itself if nothing changed.
+    """A value in which ``replace`` was applied to strings and paths; the value itself if nothing changed.
 
     Args:
-        value: See `relocated`.
-        replace: Gets the text, and whether it is that of a `Path`.
+        value: See ``relocated``.
+        replace: Gets the text, and whether it is that of a ``Path``.
     """
     if isinstance(value, (str, Path)):
         text = replace(str(value), isinstance(value, Path))

@@ -20,7 +20,7 @@ THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")  # of t
 def each(
     work: Callable[[Item], Result], items: Sequence[Item], jobs: int
 ) -> Iterator[tuple[Item, Result | Lost]]:
-    """As `saccade_lab.parallel.each`, in `jobs` processes, never in this one; -1 for one per core.
+    """As ``saccade_lab.parallel.each``, in ``jobs`` processes, never in this one; -1 for one per core.
 
     loky says that a process died, but not in which item. The items that were given out then wait until the
     others are done, and are computed in one process, one after the other: now it is known which one ends its
@@ -46,7 +46,7 @@ def each(
 def _spread(
     work: Callable[[Item], Result], items: Sequence[Item], chosen: Sequence[int], processes: int
 ) -> Iterator[tuple[int, Result | Lost]]:
-    """Index and result of chosen items. If a process dies, those that were given out are `LOST`: the end."""
+    """Index and result of chosen items. If a process dies, those in progress are ``LOST``: the end."""
     from joblib.externals.loky import get_reusable_executor
     from joblib.externals.loky.process_executor import TerminatedWorkerError
 

@@ -17,26 +17,26 @@ def each(
     """Computes items, in this process or in others, and yields each with its result when it is done.
 
     A item whose process or machine died, for whatever reason, is computed again, so its result must not
-    depend on how often it is begun. If its processes die `RETRIES` + 1 times, its result is `Lost`, and the
-    others go on.
+    depend on how often it is begun. If its processes die ``RETRIES`` + 1 times, its result is ``Lost``, and
+    the others go on.
 
     Args:
-        work: function from an item to its result. In other processes it is pickled, and keeps nothing from
+        work: Function from an item to its result. In other processes it is pickled, and keeps nothing from
             one call to the next but what its module keeps.
-        items: arguments of `work`.
-        workers: where they run.
-        files: files and directories that `work` reads. Its fields name them by strings or paths, also in
+        items: Arguments of ``work``.
+        workers: Where they run.
+        files: Files and directories that ``work`` reads. Its fields name them by strings or paths, also in
             dataclasses, sequences and mappings; relative paths and links mean what they mean here. They are
-            brought to each machine of a cluster once, and `work` then gets their paths there. Those that do
+            brought to each machine of a cluster once, and ``work`` then gets their paths there. Those that do
             not exist are left as they are.
 
     Yields:
-        Item and result, in the order of `items` if `workers.alone`, otherwise in any order.
+        Item and result, in the order of ``items`` if ``workers.alone``, otherwise in any order.
 
     Raises:
-        MissingExtraError: joblib or ray is needed and not installed.
-        InputError: there is no cluster at the address, or its machines have another version of saccade.
-        Exception: what `work` raised. Items that were begun are abandoned.
+        MissingExtraError: Joblib or ray is needed and not installed.
+        InputError: There is no cluster at the address, or its machines have another version of saccade.
+        Exception: What ``work`` raised. Items that were begun are abandoned.
 
     Example:
         >>> sorted(each(abs, [-1, 2, -3], Workers()))

@@ -19,15 +19,15 @@ class Workers:
     """The processes that work items run in.
 
     Attributes:
-        backend: `"loky"` for processes of this machine, `"ray"` for those of a Ray cluster.
+        backend: ``"loky"`` for processes of this machine, ``"ray"`` for those of a Ray cluster.
         jobs: Number of items at the same time. -1: one for each core, of this machine or of the cluster.
             With loky 1 stands for this process, which an item may then end; -1 never does, also on one core.
-        address: Address of the Ray cluster. Default: that of the environment variable `RAY_ADDRESS`, then a
+        address: Address of the Ray cluster. Default: that of the environment variable ``RAY_ADDRESS``, then a
             cluster that runs on this machine, then one that is started here for this run.
         num_threads: Threads of one item, which it reserves on a Ray cluster.
 
     Raises:
-        InputError: an unknown backend, a number out of range, or an address without Ray.
+        InputError: An unknown backend, a number out of range, or an address without Ray.
 
     Example:
         >>> Workers().alone, Workers(jobs=4).alone, Workers("ray", jobs=-1).alone

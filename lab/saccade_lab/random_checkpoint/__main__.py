@@ -6,7 +6,7 @@
 
 Everything that loads the published checkpoint loads this one, so installation, memory and speed can be tried
 before it is downloaded. Its actions mean nothing. Weights are scaled so that activations stay of order one;
-`--outliers` plants channels as large as trained models have. A tensor is drawn and written in blocks, so
+``--outliers`` plants channels as large as trained models have. A tensor is drawn and written in blocks, so
 memory stays below 0.2 GB.
 """
 

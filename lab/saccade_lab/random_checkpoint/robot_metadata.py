@@ -1,4 +1,4 @@
-"""Writes what `experiment_cfg/metadata.json` of an N1.5 checkpoint says of a robot."""
+"""Writes what ``experiment_cfg/metadata.json`` of an N1.5 checkpoint says of a robot."""
 
 from __future__ import annotations
 

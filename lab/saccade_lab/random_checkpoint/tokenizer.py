@@ -36,12 +36,12 @@ def tokenizer(*, published_ids: bool, words: Sequence[str] = ()) -> dict[str, An
 
     Args:
         published_ids: Whether tokens have their published ids, for a table of 151680 rows. Otherwise the ids
-            have no gaps; without `words` there are fewer than 512.
+            have no gaps; without ``words`` there are fewer than 512.
         words: Words that are one token each, at the beginning of a text and after a space, in addition to
-            `WORDS`. Only without published ids.
+            ``WORDS``. Only without published ids.
 
     Raises:
-        InputError: `words` are given with published ids.
+        InputError: ``words`` are given with published ids.
     """
     if published_ids and words:
         raise InputError("words: expected none with published_ids, which have no place for them")

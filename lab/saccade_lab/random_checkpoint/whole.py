@@ -34,7 +34,7 @@ _EAGLE = "NVEagle/eagle_er-qwen3_1_7B-Siglip2_400M_stage1_5_128gpu_er_v7_1mlp_no
 
 
 def small_backbone(version: str) -> dict[str, Any]:
-    """A config with the keys of `RELEASED` and sizes that take milliseconds, for the tokenizer without gaps.
+    """A config with the keys of ``RELEASED`` and small sizes, for the tokenizer without gaps.
 
     Args:
         version: ``"n1.5"``, ``"n1.6"`` or ``"n1.7"``.
@@ -74,7 +74,7 @@ def small_backbone(version: str) -> dict[str, Any]:
 
 
 def small_head(version: str) -> dict[str, Any]:
-    """The config of a small head for the features of `small_backbone`, with the published embodiments."""
+    """The config of a small head for the features of ``small_backbone``, with the published embodiments."""
     return small_config(version) | {"max_num_embodiments": 32}
 
 
@@ -104,7 +104,7 @@ def write(
         shard_bytes: A shard is complete when it reaches this size.
 
     Returns:
-        `folder`.
+        ``folder``.
 
     Raises:
         InputError: The folder is not empty, or the head takes features of another width or has too few
@@ -186,7 +186,7 @@ def _config(
     *,
     released: bool,
 ) -> dict[str, Any]:
-    """The content of `config.json`. It has sizes of the backbone only if they are not the published ones."""
+    """The content of ``config.json``, with sizes of the backbone if they are not the published ones."""
     own: dict[str, Any] = {"select_layer": sizes.num_layers}
     if not released:
         own["eagle_config"] = eagle_config(version, backbone)

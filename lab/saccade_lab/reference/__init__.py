@@ -1,8 +1,8 @@
 """The same action head and backbone in plain torch: they are trained, and the Rust ones tested against them.
 
-They favour clarity over speed: nothing is cached, and every row is computed in every block. `head` is the
-sampler and the loss, `layers` the modules, `intervene` the effect of an intervention in each block;
-`backbone` is what turns frames and words into features. Needs torch and safetensors.
+They favour clarity over speed: nothing is cached, and every row is computed in every block. ``head`` is the
+sampler and the loss, ``layers`` the modules, ``intervene`` the effect of an intervention in each block;
+``backbone`` is what turns frames and words into features. Needs torch and safetensors.
 """
 
 from saccade_lab.extras import LAB

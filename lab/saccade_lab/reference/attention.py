@@ -35,19 +35,19 @@ class Attention(nn.Module):
         stop_gradient: Tensor | None = None,
         return_weights: bool = False,
     ) -> tuple[Tensor, Tensor | None]:
-        """Attends from the rows of `x` to those of `context`.
+        """Attends from the rows of ``x`` to those of ``context``.
 
         Args:
-            x: `(B, Q, width)`.
-            context: `(B, S, context_dim)`.
-            logit_bias: added to the scaled scores, broadcast to `(B, heads, Q, S)`; minus infinity removes a
-                key. If no key is left, the attention of a query is zero.
-            stop_gradient: `(Q, S)` bool, True where the query treats this key and its value as constants in
+            x: ``(B, Q, width)``.
+            context: ``(B, S, context_dim)``.
+            logit_bias: Added to the scaled scores, broadcast to ``(B, heads, Q, S)``; minus infinity removes
+                a key. If no key is left, the attention of a query is zero.
+            stop_gradient: ``(Q, S)`` bool, True where the query treats this key and its value as constants in
                 the backward pass.
-            return_weights: whether to return the probabilities as well.
+            return_weights: Whether to return the probabilities as well.
 
         Returns:
-            `(B, Q, width)`, and the probabilities `(B, heads, Q, S)` or None.
+            ``(B, Q, width)``, and the probabilities ``(B, heads, Q, S)`` or None.
         """
         q = self.split_heads(self.to_q(x))  # (B, heads, Q, head_dim)
         k = self.split_heads(self.to_k(context))  # (B, heads, S, head_dim)
@@ -60,7 +60,7 @@ class Attention(nn.Module):
         return self.to_out[0](values.transpose(1, 2).flatten(2)), weights  # (B, Q, width)
 
     def split_heads(self, x: Tensor) -> Tensor:
-        """`(B, S, heads * head_dim)` to `(B, heads, S, head_dim)`."""
+        """``(B, S, heads * head_dim)`` to ``(B, heads, S, head_dim)``."""
         return x.unflatten(-1, (self.num_heads, self.head_dim)).transpose(1, 2)
 
 
@@ -70,13 +70,13 @@ def attention_weights(
     """softmax(q k^T / sqrt(head_dim) + bias), or zeros if no key is left.
 
     Args:
-        q: `(B, heads, Q, head_dim)`.
-        k: `(B, heads, S, head_dim)`.
-        logit_bias: broadcast to `(B, heads, Q, S)`, or None.
-        stop_gradient: `(Q, S)` bool, True where the key is a constant; or None.
+        q: ``(B, heads, Q, head_dim)``.
+        k: ``(B, heads, S, head_dim)``.
+        logit_bias: Broadcast to ``(B, heads, Q, S)``, or None.
+        stop_gradient: ``(Q, S)`` bool, True where the key is a constant; or None.
 
     Returns:
-        `(B, heads, Q, S)`.
+        ``(B, heads, Q, S)``.
     """
     logits = q @ k.transpose(-1, -2)  # (B, heads, Q, S)
     if stop_gradient is not None:
@@ -90,15 +90,15 @@ def attention_weights(
 
 
 def fused_attention(q: Tensor, k: Tensor, v: Tensor, logit_bias: Tensor | None) -> Tensor:
-    """The sums of `attention_weights` and `attention_values` by torch's own kernel: faster in training.
+    """The sums of ``attention_weights`` and ``attention_values`` by torch's own kernel: faster in training.
 
     Args:
-        q: `(B, heads, Q, head_dim)`.
-        k, v: `(B, heads, S, head_dim)`.
-        logit_bias: broadcast to `(B, heads, Q, S)`, or None.
+        q: ``(B, heads, Q, head_dim)``.
+        k, v: ``(B, heads, S, head_dim)``.
+        logit_bias: Broadcast to ``(B, heads, Q, S)``, or None.
 
     Returns:
-        `(B, heads, Q, head_dim)`.
+        ``(B, heads, Q, head_dim)``.
     """
     if logit_bias is None:
         return F.scaled_dot_product_attention(q, k, v)
@@ -108,7 +108,7 @@ def fused_attention(q: Tensor, k: Tensor, v: Tensor, logit_bias: Tensor | None) 
 
 
 def split_bias(logit_bias: Tensor) -> tuple[Tensor, Tensor]:
-    """The bias with zeros for queries that no key is left to, and which these are, `(..., 1)` bool.
+    """The bias with zeros for queries that no key is left to, and which these are, ``(..., 1)`` bool.
 
     Their softmax would be NaN, and so would be its gradient even if the value is replaced. Found in the bias,
     which mostly is much smaller than the scores.
@@ -121,12 +121,12 @@ def attention_values(weights: Tensor, v: Tensor, stop_gradient: Tensor | None) -
     """The mean of the values, weighted by the probabilities.
 
     Args:
-        weights: `(B, heads, Q, S)`.
-        v: `(B, heads, S, head_dim)`.
-        stop_gradient: `(Q, S)` bool, True where the value is a constant; or None.
+        weights: ``(B, heads, Q, S)``.
+        v: ``(B, heads, S, head_dim)``.
+        stop_gradient: ``(Q, S)`` bool, True where the value is a constant; or None.
 
     Returns:
-        `(B, heads, Q, head_dim)`.
+        ``(B, heads, Q, head_dim)``.
     """
     if stop_gradient is None:
         return weights @ v

@@ -21,7 +21,7 @@ def check_shape(name: str, tensor: Tensor, expected: tuple[int | None, ...]) -> 
 
 
 def check_indices(name: str, indices: Iterable[int] | None, size: int) -> None:
-    """Raises InputError unless all indices are below `size`. None means all."""
+    """Raises InputError unless all indices are below ``size``. None means all."""
     for index in indices or ():
         if index >= size:
             expected = f"0 to {size - 1}" if size > 0 else "no index, because there are no tokens"
@@ -34,7 +34,7 @@ def as_embodiment(
     """Checks embodiment ids. One id stays an int, so that one matrix product serves the whole batch.
 
     Raises:
-        InputError: They are not integers, or not below `num_embodiments`.
+        InputError: They are not integers, or not below ``num_embodiments``.
         ShapeError: There is not one id for each row.
     """
     ids = embodiment_id if isinstance(embodiment_id, Tensor) else torch.tensor(embodiment_id)

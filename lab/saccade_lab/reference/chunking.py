@@ -19,11 +19,12 @@ def start_of(
     """What a chunk starts from, and the factor of its velocity: the noise and None without a previous chunk.
 
     Returns:
-        `continued (B, T, encoder_action_dim)` and `velocity_strength (T, 1)`.
+        ``continued (B, T, encoder_action_dim)`` and ``velocity_strength (T, 1)``.
 
     Raises:
-        ShapeError: the previous chunk has the wrong shape.
-        InputError: one of `previous` and `chunking` is given without the other, or they do not fit the head.
+        ShapeError: The previous chunk has the wrong shape.
+        InputError: One of ``previous`` and ``chunking`` is given without the other, or they do not fit the
+            head.
     """
     if (previous is None) != (chunking is None):
         given, missing = ("chunking", "previous_chunk") if chunking else ("previous_chunk", "chunking")
@@ -39,17 +40,17 @@ def continued(start: Tensor, previous: Tensor, chunking: Chunking, config: HeadC
     """Noise whose first actions are replaced by the end of the previous chunk.
 
     Args:
-        start: the noise, `(B, T, encoder_action_dim)`.
-        previous: the previous chunk, `(B, rows, action_dim)` or `(B, rows, encoder_action_dim)`.
-        chunking: how many actions are replaced, and where they are in the previous chunk.
-        config: config of the head.
+        start: The noise, ``(B, T, encoder_action_dim)``.
+        previous: The previous chunk, ``(B, rows, action_dim)`` or ``(B, rows, encoder_action_dim)``.
+        chunking: How many actions are replaced, and where they are in the previous chunk.
+        config: Config of the head.
 
     Returns:
-        `(B, T, encoder_action_dim)`.
+        ``(B, T, encoder_action_dim)``.
 
     Raises:
-        ShapeError: the previous chunk has another shape.
-        InputError: overlap or horizon do not fit the head.
+        ShapeError: The previous chunk has another shape.
+        InputError: Overlap or horizon do not fit the head.
     """
     horizon = config.action_horizon if chunking.horizon is None else chunking.horizon
     if not chunking.overlap <= horizon <= config.action_horizon:
@@ -70,12 +71,12 @@ def velocity_strength(chunking: Chunking, action_horizon: int) -> np.ndarray:
     """The factor of the velocity of each action of a chunk that continues the previous one.
 
     Args:
-        chunking: frozen actions do not change, and the rest of the overlap is released gradually.
-        action_horizon: number of actions in a chunk.
+        chunking: Frozen actions do not change, and the rest of the overlap is released gradually.
+        action_horizon: Number of actions in a chunk.
 
     Returns:
-        `(action_horizon,)` float64: 0 for the f frozen actions; then, up to the overlap o, for action j
-        (1 - exp(-a r)) / (1 - exp(-a)) with r = (j - f + 1) / (o - f + 1) and a = `ramp_rate`; then 1.
+        ``(action_horizon,)`` float64: 0 for the f frozen actions; then, up to the overlap o, for action j
+        (1 - exp(-a r)) / (1 - exp(-a)) with r = (j - f + 1) / (o - f + 1) and a = ``ramp_rate``; then 1.
     """
     frozen, overlap = chunking.frozen, chunking.overlap
     strength = np.ones(action_horizon)

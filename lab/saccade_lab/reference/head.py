@@ -1,7 +1,7 @@
 """The GR00T action heads as one torch module: N1, N1.5, N1.6, N1.7 and a fork.
 
 They are one architecture with different sizes and switches. Module names follow the checkpoint, so that
-`state_dict()` has the released tensor names. Shapes in comments: B is the batch, R the rows of the query
+``state_dict()`` has the released tensor names. Shapes in comments: B is the batch, R the rows of the query
 sequence (H state rows, N future rows, T action rows), S the vision-language tokens.
 """
 
@@ -52,17 +52,17 @@ if TYPE_CHECKING:
 class ActionHead(nn.Module):
     """A GR00T action head in torch.
 
-    The head computes in the dtype of its parameters (`.double()` for float64) and is differentiable. Inputs
-    may be NumPy arrays and are converted to that dtype. Wrap calls in `torch.no_grad()` if no gradient is
+    The head computes in the dtype of its parameters (``.double()`` for float64) and is differentiable. Inputs
+    may be NumPy arrays and are converted to that dtype. Wrap calls in ``torch.no_grad()`` if no gradient is
     needed. A new head has the initial distribution of the released code. Unlike the released training, there
-    is no dropout, and states are not made noisy, nor dropped except by `dropout_prob_by_embodiment`.
+    is no dropout, and states are not made noisy, nor dropped except by ``dropout_prob_by_embodiment``.
 
     Args:
-        config: sizes and switches.
-        time_distribution: the distribution of `sample_time`.
-        unused: names of parameters that only the released training uses (`task_log_sigma.NAME`,
-            `mask_token`). They are kept, so that a checkpoint stays complete.
-        has_state_dropout: whether there is `dropout_prob_by_embodiment`, `(num_embodiments,)`, zeros at
+        config: Sizes and switches.
+        time_distribution: The distribution of ``sample_time``.
+        unused: Names of parameters that only the released training uses (``task_log_sigma.NAME``,
+            ``mask_token``). They are kept, so that a checkpoint stays complete.
+        has_state_dropout: Whether there is ``dropout_prob_by_embodiment``, ``(num_embodiments,)``, zeros at
             first. The states of embodiments with an entry above 0.999 are set to zero.
 
     Example:
@@ -131,8 +131,8 @@ class ActionHead(nn.Module):
                 :meth:`saccade.ActionHead.from_pretrained` reads, or the id of a published checkpoint.
             revision: A branch, tag or commit of the id. Default: ``main``.
             config: The config of the checkpoint or of the head, as a dict or a path. Default: the
-                `config.json` in the same directory, or else the `config` entry in the metadata of a single
-                file.
+                ``config.json`` in the same directory, or else the ``config`` entry in the metadata of a
+                single file.
             num_states: Number of states in an observation, as for :meth:`saccade.ActionHead.from_pretrained`.
             dtype: Dtype of the parameters. Narrower stored dtypes are widened, which is exact.
 
@@ -141,7 +141,7 @@ class ActionHead(nn.Module):
             PermissionError: The Hub denies access to the id.
             CheckpointError: There is no config, or tensors are missing, unknown or of the wrong shape. The
                 message lists all of them.
-            InputError: `num_states` is out of range.
+            InputError: ``num_states`` is out of range.
         """
         checkpoint = loading.described(resolve(id_or_path, revision, files=HEAD), config)
         whole, names = checkpoint.head_config, loading.tensor_names(checkpoint)
@@ -173,7 +173,7 @@ class ActionHead(nn.Module):
 
     @property
     def learned_tokens(self) -> Tensor:
-        """The future tokens, `(N, width)`. Only N1.5 has any."""
+        """The future tokens, ``(N, width)``. Only N1.5 has any."""
         if self.config.version == "n1.5":
             return self.future_tokens.weight
         return torch.empty(0, self.config.width, dtype=self.dtype, device=self.device)
@@ -184,13 +184,14 @@ class ActionHead(nn.Module):
         Every token attends to every other one. The masks of N1.6 and N1.7 apply to the later blocks only.
 
         Args:
-            backbone_features: `(B, S, context_dim)`.
-            drop_vl: bool `(B, S)`, True for tokens that are removed, as if they were not in the input. Their
-                places remain and are zero, so `velocity`, `sample` and `trace` need `drop_vl` as well.
+            backbone_features: ``(B, S, context_dim)``.
+            drop_vl: Bool ``(B, S)``, True for tokens that are removed, as if they were not in the input.
+                Their places remain and are zero, so ``velocity``, ``sample`` and ``trace`` need ``drop_vl``
+                as well.
 
         Returns:
-            `vl_embs (B, S, context_dim)`. These are the features themselves if the head has neither `vlln`
-            nor VL self-attention.
+            ``vl_embs (B, S, context_dim)``. These are the features themselves if the head has neither
+            ``vlln`` nor VL self-attention.
         """
         features = self.as_input(backbone_features)
         check_shape("backbone_features", features, (None, None, self.config.context_dim))
@@ -214,20 +215,20 @@ class ActionHead(nn.Module):
         """The velocity of the flow at noisy actions.
 
         Args:
-            vl_embs: `(B, S, context_dim)`, from `encode`.
-            state: `(B, num_states, state_dim)`, or `(B, state_dim)` for one state; normalised and padded.
-            embodiment_id: an int, or `(B,)`.
-            actions: `(B, T, encoder_action_dim)`.
-            timestep: time bucket, an int or `(B,)`.
-            **conditions: `drop_vl`, `attention_mask`, `image_mask`, `intervention` and `stop_gradient` as in
-                `trace`. This evaluation is step 0 of 1.
+            vl_embs: ``(B, S, context_dim)``, from ``encode``.
+            state: ``(B, num_states, state_dim)``, or ``(B, state_dim)`` for one state; normalised and padded.
+            embodiment_id: An int, or ``(B,)``.
+            actions: ``(B, T, encoder_action_dim)``.
+            timestep: Time bucket, an int or ``(B,)``.
+            **conditions: ``drop_vl``, ``attention_mask``, ``image_mask``, ``intervention`` and
+                ``stop_gradient`` as in ``trace``. This evaluation is step 0 of 1.
 
         Returns:
-            `(B, T, action_dim)`.
+            ``(B, T, action_dim)``.
 
         Raises:
-            ShapeError: an array has the wrong shape.
-            InputError: the head does not have the embodiment, or a place of an intervention.
+            ShapeError: An array has the wrong shape.
+            InputError: The head does not have the embodiment, or a place of an intervention.
         """
         vl_embs = self.as_input(vl_embs)
         check_shape("vl_embs", vl_embs, (None, None, self.config.context_dim))
@@ -244,7 +245,7 @@ class ActionHead(nn.Module):
         actions: Tensor | np.ndarray,
         timestep: int | Tensor | np.ndarray,
     ) -> Tensor:
-        """One velocity evaluation of a run. Arguments and result are as in `velocity`."""
+        """One velocity evaluation of a run. Arguments and result are as in ``velocity``."""
         config, horizon = self.config, self.config.action_horizon
         actions, state = self.as_input(actions), self.as_input(state)
         batch = vl_embs.shape[0]
@@ -289,28 +290,28 @@ class ActionHead(nn.Module):
         """Follows the flow from noise (time 0) to actions (time 1) in equal steps.
 
         Args:
-            vl_embs, state, embodiment_id: as in `velocity`.
-            noise: `(B, T, encoder_action_dim)`, standard normal.
-            num_steps: number of steps. Default: that of the config.
+            vl_embs, state, embodiment_id: As in ``velocity``.
+            noise: ``(B, T, encoder_action_dim)``, standard normal.
+            num_steps: Number of steps. Default: that of the config.
             integrator: "euler" (default), or "midpoint", which evaluates the velocity twice in each step.
-            future_refresh: the state rows and the future rows are recomputed every `future_refresh` velocity
-                evaluations, starting with the first. At the others, self-attention reads them as they were.
-                Default: at every evaluation.
-            previous_chunk: the chunk that the robot is executing, `(B, rows, action_dim)` or `(B, rows,
-                encoder_action_dim)`, normalised, with at least `chunking.horizon` rows. Required with
-                `chunking`.
-            chunking: how this chunk continues the previous one. `velocity_strength` is the factor of the
+            future_refresh: The state rows and the future rows are recomputed every ``future_refresh``
+                velocity evaluations, starting with the first. At the others, self-attention reads them as
+                they were. Default: at every evaluation.
+            previous_chunk: The chunk that the robot is executing, ``(B, rows, action_dim)`` or `(B, rows,
+                encoder_action_dim)``, normalised, with at least ``chunking.horizon` rows. Required with
+                ``chunking``.
+            chunking: How this chunk continues the previous one. ``velocity_strength`` is the factor of the
                 velocity, in both evaluations of a midpoint step.
-            **conditions: `drop_vl`, `attention_mask`, `image_mask`, `intervention` and `stop_gradient` as in
-                `trace`. All evaluations of a step belong to that step. A patch of rows at a step where they
-                are not always computed is an error.
+            **conditions: ``drop_vl``, ``attention_mask``, ``image_mask``, ``intervention`` and
+                ``stop_gradient`` as in ``trace``. All evaluations of a step belong to that step. A patch of
+                rows at a step where they are not always computed is an error.
 
         Returns:
-            Actions `(B, T, action_dim)`, normalised.
+            Actions ``(B, T, action_dim)``, normalised.
 
         Raises:
-            ShapeError, DtypeError: an array does not fit.
-            InputError: a value is out of range, or an intervention does not fit the head.
+            ShapeError, DtypeError: An array does not fit.
+            InputError: A value is out of range, or an intervention does not fit the head.
         """
         vl_embs = self.as_input(vl_embs)
         run = self.run_of(
@@ -341,33 +342,33 @@ class ActionHead(nn.Module):
         blocks: Sequence[int] | int | None = None,
         steps: Sequence[int] | int | None = None,
     ) -> Trace[Tensor]:
-        """Samples as `sample` does, and records attention and hidden states, which are part of the graph.
+        """Samples as ``sample`` does, and records attention and hidden states, which are part of the graph.
 
         The gradient with stopped edges is the sum over all paths from the result back to an input that use
-        none of these edges. With `[("state", "future"), ("action", "future")]`, it is the part that does not
-        pass through future rows. The total gradient minus this is the part that does.
+        none of these edges. With ``[("state", "future"), ("action", "future")]``, it is the part that does
+        not pass through future rows. The total gradient minus this is the part that does.
 
         Args:
-            vl_embs, state, embodiment_id, noise, num_steps: as in `sample`.
-            drop_vl: bool `(B, S)`, as given to `encode`: no row attends to these tokens.
-            attention_mask: bool `(B, S)`, True where a token is attended. Default: everywhere. A head that
+            vl_embs, state, embodiment_id, noise, num_steps: As in ``sample``.
+            drop_vl: Bool ``(B, S)``, as given to ``encode``: no row attends to these tokens.
+            attention_mask: Bool ``(B, S)``, True where a token is attended. Default: everywhere. A head that
                 ignores padding accepts an all-true mask only.
-            image_mask: bool `(B, S)`, True for image tokens. Required for N1.6 and N1.7, whose
+            image_mask: Bool ``(B, S)``, True for image tokens. Required for N1.6 and N1.7, whose
                 cross-attention blocks attend to text and images in turn.
-            intervention: one or several :class:`saccade.Intervention`.
-            stop_gradient: pairs (reader, source) as in `Intervention.cut`, in all blocks, steps and heads.
+            intervention: One or several :class:`saccade.Intervention`.
+            stop_gradient: Pairs (reader, source) as in ``Intervention.cut``, in all blocks, steps and heads.
                 The result is unchanged up to rounding, but in the backward pass the rows of the reader treat
                 the keys and values of the source as constants.
-            record: what is recorded, any of "attention" and "hidden".
-            blocks: the blocks that are recorded. Default: all.
-            steps: the steps that are recorded. Default: all.
+            record: What is recorded, any of "attention" and "hidden".
+            blocks: The blocks that are recorded. Default: all.
+            steps: The steps that are recorded. Default: all.
 
         Returns:
-            Attention probabilities, rows after the blocks, and the actions of `sample` up to rounding.
+            Attention probabilities, rows after the blocks, and the actions of ``sample`` up to rounding.
 
         Raises:
-            ShapeError, DtypeError: an array does not fit.
-            InputError: a value is out of range, or an intervention does not fit the head.
+            ShapeError, DtypeError: An array does not fit.
+            InputError: A value is out of range, or an intervention does not fit the head.
         """
         vl_embs = self.as_input(vl_embs)
         run = self.run_of(
@@ -407,9 +408,9 @@ class ActionHead(nn.Module):
         start: Tensor,
         strength: Tensor | None = None,
     ) -> Tensor:
-        """The steps of `sample` from `start (B, T, encoder_action_dim)` to `(B, T, action_dim)`.
+        """The steps of ``sample`` from ``start (B, T, encoder_action_dim)`` to ``(B, T, action_dim)``.
 
-        `strength (T, 1)` multiplies the velocity. If the head decodes fewer dimensions than it encodes, the
+        ``strength (T, 1)`` multiplies the velocity. If the head decodes fewer dimensions than it encodes, the
         others are kept at 0.
         """
         config = self.config
@@ -437,7 +438,7 @@ class ActionHead(nn.Module):
         embodiment_id: int | Tensor | np.ndarray,
         **options: Unpack[SampleOptions],
     ) -> Tensor:
-        """`encode` followed by `sample`, whose keyword arguments it accepts; `noise` is required."""
+        """``encode`` followed by ``sample``, whose keyword arguments it accepts; ``noise`` is required."""
         vl_embs = self.encode(backbone_features, drop_vl=options.get("drop_vl"))
         return self.sample(vl_embs, state, embodiment_id, **options)
 
@@ -445,11 +446,11 @@ class ActionHead(nn.Module):
         """Draws flow times for training.
 
         Args:
-            batch: number of times.
-            generator: default torch's own.
+            batch: Number of times.
+            generator: Default torch's own.
 
         Returns:
-            `(batch,)`, in [0, scale].
+            ``(batch,)``, in [0, scale].
         """
         drawn = self.time_distribution.draw(batch, generator)
         return torch.as_tensor(drawn, dtype=self.dtype, device=self.device)
@@ -468,19 +469,19 @@ class ActionHead(nn.Module):
         image_mask: Mask = None,
         drop_vl: Mask = None,
     ) -> Tensor:
-        """Flow-matching loss: between noise and actions, the velocity should be `actions - noise`.
+        """Flow-matching loss: between noise and actions, the velocity should be ``actions - noise``.
 
-        Dimensions that the head encodes and does not decode are 0, as in `sample`. All decoders have the same
-        weight, unlike in a fork that learns the weights (`task_log_sigma`).
+        Dimensions that the head encodes and does not decode are 0, as in ``sample``. All decoders have the
+        same weight, unlike in a fork that learns the weights (``task_log_sigma``).
 
         Args:
-            backbone_features: `(B, S, context_dim)`.
-            state, embodiment_id: as in `velocity`.
-            actions: the demonstrated chunk, `(B, T, action_dim)`, normalised.
-            noise: the same shape, standard normal.
-            time: `(B,)`, from `sample_time`.
-            action_mask: weights of the squared errors, broadcast to `actions`. Default: equal weights.
-            attention_mask, image_mask, drop_vl: as in `trace`.
+            backbone_features: ``(B, S, context_dim)``.
+            state, embodiment_id: As in ``velocity``.
+            actions: The demonstrated chunk, ``(B, T, action_dim)``, normalised.
+            noise: The same shape, standard normal.
+            time: ``(B,)``, from ``sample_time``.
+            action_mask: Weights of the squared errors, broadcast to ``actions``. Default: equal weights.
+            attention_mask, image_mask, drop_vl: As in ``trace``.
 
         Returns:
             A scalar.

@@ -1,6 +1,6 @@
 """What one run of the torch reference changes and records, block by block.
 
-It is written from the definition of `Intervention`, independently of the Rust head, so that each tests the
+It is written from the definition of ``Intervention``, independently of the Rust head, so that each tests the
 other. Shapes in comments: B is the batch, R the rows, S the vision-language tokens, Q the rows that attend, K
 the keys that they attend to: the vision-language tokens in a cross-attention block, the rows in a
 self-attention block.
@@ -30,15 +30,15 @@ class BlockChange:
     """What one block of one velocity evaluation changes and records. By default nothing.
 
     Attributes:
-        logit_bias: added to the scaled scores of the attention, broadcast to `(B, heads, Q, K)`; minus
+        logit_bias: Added to the scaled scores of the attention, broadcast to ``(B, heads, Q, K)``; minus
             infinity removes a key.
-        stop_gradient: `(Q, K)` bool, True where the reader treats key and value as constants.
-        patches: pairs of row indices `(n,)` and new values of these rows after the block, `(n, width)` or
-            `(B, n, width)`. Later patches override earlier ones.
-        others: earlier rows that are not recomputed, as self-attention read them last, `(B, O, width)`.
-        hold: called with the rows as self-attention reads them, `(B, R, width)`.
-        keep_attention: called with the probabilities `(B, heads, Q, K)`.
-        keep_hidden: called with the rows after the block and its patches, `(B, R, width)`.
+        stop_gradient: ``(Q, K)`` bool, True where the reader treats key and value as constants.
+        patches: Pairs of row indices ``(n,)`` and new values of these rows after the block, ``(n, width)`` or
+            ``(B, n, width)``. Later patches override earlier ones.
+        others: Earlier rows that are not recomputed, as self-attention read them last, ``(B, O, width)``.
+        hold: Called with the rows as self-attention reads them, ``(B, R, width)``.
+        keep_attention: Called with the probabilities ``(B, heads, Q, K)``.
+        keep_hidden: Called with the rows after the block and its patches, ``(B, R, width)``.
     """
 
     logit_bias: Tensor | None = None
@@ -50,13 +50,13 @@ class BlockChange:
     keep_hidden: Callable[[Tensor], None] | None = None
 
     def all_rows(self, y: Tensor) -> Tensor:
-        """The rows that self-attention reads, `(B, R, width)`, from the computed ones, `(B, R', width)`."""
+        """The rows that self-attention reads, ``(B, R, width)``, from the computed ``(B, R', width)``."""
         if self.hold is not None:
             self.hold(y)
         return y if self.others is None else torch.cat((self.others, y), dim=1)
 
     def after(self, rows: Tensor) -> Tensor:
-        """Applies the patches to `rows (B, R, width)`; returns the rows that the next block reads."""
+        """Applies the patches to ``rows (B, R, width)``; returns the rows that the next block reads."""
         for index, values in self.patches:
             rows = rows.index_copy(1, index, values.expand(len(rows), -1, -1))
         if self.keep_hidden is not None:
@@ -66,9 +66,9 @@ class BlockChange:
 
 @dataclass(frozen=True)
 class Edit:
-    """An `Intervention` with normalised fields and with tensors in the dtype of the run.
+    """An ``Intervention`` with normalised fields and with tensors in the dtype of the run.
 
-    Its fields are those of `Intervention` except the future tokens.
+    Its fields are those of ``Intervention`` except the future tokens.
     """
 
     cut: tuple[tuple[Chosen, Chosen], ...]
@@ -80,7 +80,7 @@ class Edit:
 
     @classmethod
     def of(cls, one: Any, like: Tensor) -> "Edit":
-        """Converts an `Intervention`."""
+        """Converts an ``Intervention``."""
 
         def tensors(arrays: Mapping[Chosen, np.ndarray] | None) -> dict[Chosen, Tensor]:
             found = (arrays or {}).items()
@@ -103,26 +103,26 @@ class Run:
     """One run of a head over all of its steps: what is changed, and what is recorded.
 
     Args:
-        config: config of the head.
-        vl_embs: `(B, S, context_dim)`. The run has its dtype and device.
-        num_steps: number of steps.
-        in_step: velocity evaluations in each step.
-        future_refresh: the state rows and the future rows are recomputed every `future_refresh` evaluations,
-            starting with the first.
-        intervention: one, several or none.
-        drop_vl, attention_mask, image_mask: as in `forbidden_tokens`.
-        stop_gradient: pairs as in `Intervention.cut`, which apply to the backward pass only.
-        record: any of "attention" and "hidden".
-        blocks, steps: what is recorded. Default: all.
+        config: Config of the head.
+        vl_embs: ``(B, S, context_dim)``. The run has its dtype and device.
+        num_steps: Number of steps.
+        in_step: Velocity evaluations in each step.
+        future_refresh: The state rows and the future rows are recomputed every ``future_refresh``
+            evaluations, starting with the first.
+        intervention: One, several or none.
+        drop_vl, attention_mask, image_mask: As in ``forbidden_tokens``.
+        stop_gradient: Pairs as in ``Intervention.cut``, which apply to the backward pass only.
+        record: Any of "attention" and "hidden".
+        blocks, steps: What is recorded. Default: all.
 
     Attributes:
-        rows: the slice of each group of rows.
-        future_tokens: `(N', width)`, used in place of the learned ones, or None.
-        held: the state rows and the future rows as self-attention last read them, by block.
-        attention, hidden: what was recorded so far, by `(step, block)`.
+        rows: The slice of each group of rows.
+        future_tokens: ``(N', width)``, used in place of the learned ones, or None.
+        held: The state rows and the future rows as self-attention last read them, by block.
+        attention, hidden: What was recorded so far, by ``(step, block)``.
 
     Raises:
-        InputError, ShapeError, DtypeError: an argument does not fit the head or the inputs.
+        InputError, ShapeError, DtypeError: An argument does not fit the head or the inputs.
     """
 
     def __init__(
@@ -187,7 +187,7 @@ class Run:
         return 0 if evaluation % self.future_refresh == 0 else self.rows["action"].start
 
     def hold(self, block: int, y: Tensor) -> None:
-        """Keeps the state rows and the future rows of all rows `(B, R, width)`."""
+        """Keeps the state rows and the future rows of all rows ``(B, R, width)``."""
         self.held[block] = y[:, : self.rows["action"].start]
 
     def change(self, evaluation: int, block: int) -> BlockChange:
@@ -210,7 +210,7 @@ class Run:
         )
 
     def logit_bias(self, step: int, block: int, cross: bool) -> Tensor | None:
-        """The sum of all biases, broadcast to `(B, heads, Q, K)`; None if there is none."""
+        """The sum of all biases, broadcast to ``(B, heads, Q, K)``; None if there is none."""
         biases = []
         if cross and (forbidden := self.forbidden[block]) is not None:
             biases.append(removal_bias(forbidden, self.dtype))  # (B, 1, 1, S)
@@ -227,7 +227,7 @@ class Run:
         return sum(biases[1:], biases[0]) if biases else None
 
     def key_bias(self, edit: Edit, cross: bool) -> Tensor:
-        """The biases on the keys of this kind of block, `(Q, K)`, equal for every reader."""
+        """The biases on the keys of this kind of block, ``(Q, K)``, equal for every reader."""
         bias = torch.zeros(self.num_keys(cross), dtype=self.dtype, device=self.device)
         for chosen, values in edit.key_bias.items():
             if (chosen[0] == "vl") == cross:
@@ -235,7 +235,7 @@ class Run:
         return bias.expand(self.num_rows, -1)
 
     def cut_keys(self, edit: Edit, cross: bool) -> Tensor:
-        """The edges that are cut in this kind of block, `(Q, K)` bool."""
+        """The edges that are cut in this kind of block, ``(Q, K)`` bool."""
         hidden = torch.zeros(self.num_rows, self.num_keys(cross), dtype=torch.bool, device=self.device)
         for reader, source in edit.cut:
             if (source[0] == "vl") == cross:
@@ -243,7 +243,7 @@ class Run:
         return hidden
 
     def patches(self, place: tuple[int, int]) -> list[tuple[Tensor, Tensor]]:
-        """Row indices `(n,)` and their new values, `(n, width)` or `(B, n, width)`, in the order given."""
+        """``future_key_bias`` on the keys of the rows, ``(1, 1, 1, R)``; zero for other tokens."""
         return [
             (self.places(chosen), values)
             for edit in self.edits
@@ -251,7 +251,7 @@ class Run:
         ]
 
     def places(self, chosen: Chosen) -> Tensor:
-        """Indices of tokens among the rows, or among the vision-language tokens, `(n,)` long."""
+        """Indices of tokens among the rows, or among the vision-language tokens, ``(n,)`` long."""
         group, indices = chosen
         first = 0 if group == "vl" else self.rows[group].start
         numbers = range(self.sizes[group]) if indices is None else indices
@@ -262,7 +262,7 @@ class Run:
         return self.sizes["vl"] if cross else self.num_rows
 
     def bias_of_learned_tokens(self) -> Tensor | None:
-        """`future_key_bias` on the keys of the rows, `(1, 1, 1, R)`. It does not apply to other tokens."""
+        """Row indices ``(n,)`` and their new values, ``(n, width)`` or ``(B, n, width)``, in order."""
         if self.config.future_key_bias is None or self.future_tokens is not None:
             return None
         bias = torch.zeros(self.num_rows, dtype=self.dtype, device=self.device)
@@ -272,7 +272,7 @@ class Run:
         return bias[None, None, None]
 
     def replaced_tokens(self, interventions: Sequence[Intervention]) -> Tensor | None:
-        """The future tokens of the only intervention that has any, `(N', width)`, or None.
+        """The future tokens of the only intervention that has any, ``(N', width)``, or None.
 
         Raises:
             InputError: Several interventions have future tokens.
@@ -331,12 +331,12 @@ class Run:
         """Refuses a cut or bias that has no effect in any of the blocks where it applies.
 
         Args:
-            edge: what is changed, for the message.
-            group: the group of the keys.
-            blocks: where it applies.
+            edge: What is changed, for the message.
+            group: The group of the keys.
+            blocks: Where it applies.
 
         Raises:
-            InputError: says in which blocks the keys are read.
+            InputError: Says in which blocks the keys are read.
         """
         kind = "cross" if group == "vl" else "self"
         existing = [
@@ -378,7 +378,7 @@ def stopped_edges(pairs: Sequence[tuple[Tokens, Tokens]]) -> Intervention:
     """Pairs (reader, source) as the normalised cut of an intervention.
 
     Raises:
-        InputError: A pair is not one that `Intervention.cut` takes.
+        InputError: A pair is not one that ``Intervention.cut`` takes.
     """
     try:
         return Intervention(cut=pairs)
@@ -400,18 +400,18 @@ def forbidden_tokens(
     """The vision-language tokens that no row attends to, for each block.
 
     Args:
-        config: config of the head.
-        tokens: `(B, S, context_dim)`.
-        drop_vl: bool `(B, S)`, True for tokens that are removed.
-        attention_mask: bool `(B, S)`, True where a token is attended; None for all.
-        image_mask: bool `(B, S)`, True for image tokens. Required with alternate masks.
+        config: Config of the head.
+        tokens: ``(B, S, context_dim)``.
+        drop_vl: Bool ``(B, S)``, True for tokens that are removed.
+        attention_mask: Bool ``(B, S)``, True where a token is attended; None for all.
+        image_mask: Bool ``(B, S)``, True for image tokens. Required with alternate masks.
 
     Returns:
-        For every block bool `(B, S)`, or None if it attends to all tokens.
+        For every block bool ``(B, S)``, or None if it attends to all tokens.
 
     Raises:
-        DtypeError, ShapeError: a mask has the wrong dtype or shape.
-        InputError: padding is given to a head that ignores it, a mask is missing, or a block has no token to
+        DtypeError, ShapeError: A mask has the wrong dtype or shape.
+        InputError: Padding is given to a head that ignores it, a mask is missing, or a block has no token to
             attend to in an observation.
     """
     removed = token_mask("drop_vl", drop_vl, tokens)
@@ -449,11 +449,11 @@ def forbidden_tokens(
 
 
 def token_mask(name: str, given: Mask, tokens: Tensor) -> Tensor | None:
-    """A mask for `tokens (B, S, context_dim)` as a bool tensor `(B, S)`, or None.
+    """A mask for ``tokens (B, S, context_dim)`` as a bool tensor ``(B, S)``, or None.
 
     Raises:
-        DtypeError: the mask is not boolean.
-        ShapeError: the mask has another shape.
+        DtypeError: The mask is not boolean.
+        ShapeError: The mask has another shape.
     """
     array = boolean(name, given)
     if array is None:
@@ -464,6 +464,6 @@ def token_mask(name: str, given: Mask, tokens: Tensor) -> Tensor | None:
 
 
 def removal_bias(removed: Tensor, dtype: torch.dtype) -> Tensor:
-    """Minus infinity on removed keys, `(B, 1, 1, S)`, from `(B, S)` bool."""
+    """Minus infinity on removed keys, ``(B, 1, 1, S)``, from ``(B, S)`` bool."""
     bias = torch.zeros(removed.shape, dtype=dtype, device=removed.device).masked_fill(removed, -torch.inf)
     return bias[:, None, None]

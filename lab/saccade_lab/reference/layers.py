@@ -32,7 +32,7 @@ class GeluLinear(nn.Module):
         self.proj = nn.Linear(in_features, out_features)
 
     def forward(self, x: Tensor) -> Tensor:
-        """`(..., in_features)` to `(..., out_features)`."""
+        """``(..., in_features)`` to ``(..., out_features)``."""
         return F.gelu(self.proj(x), approximate="tanh")
 
 
@@ -44,7 +44,7 @@ class FeedForward(nn.Module):
         self.net = nn.ModuleList([GeluLinear(width, 4 * width), nn.Identity(), nn.Linear(4 * width, width)])
 
     def forward(self, x: Tensor) -> Tensor:
-        """`(..., width)` to the same shape."""
+        """``(..., width)`` to the same shape."""
         for layer in self.net:
             x = layer(x)
         return x
@@ -62,7 +62,7 @@ class VlBlock(nn.Module):
         self.ff = FeedForward(width)
 
     def forward(self, x: Tensor, logit_bias: Tensor | None = None) -> Tensor:
-        """`x (B, S, context_dim)` to the same shape; the bias is as in `Attention`."""
+        """``x (B, S, context_dim)`` to the same shape; the bias is as in ``Attention``."""
         y = self.norm1(x)
         attended, _ = self.attn1(y, y, logit_bias=logit_bias)
         x = x + attended
@@ -77,7 +77,7 @@ class VlSelfAttention(nn.Module):
         self.transformer_blocks = nn.ModuleList(VlBlock(config) for _ in range(config.vl_num_layers))
 
     def forward(self, x: Tensor, logit_bias: Tensor | None = None) -> Tensor:
-        """`x (B, S, context_dim)` to the same shape; the bias is as in `Attention`."""
+        """``x (B, S, context_dim)`` to the same shape; the bias is as in ``Attention``."""
         for block in self.transformer_blocks:
             x = block(x, logit_bias)
         return x
@@ -91,7 +91,7 @@ class AdaptiveNorm(nn.Module):
         self.linear = nn.Linear(width, 2 * width)
 
     def forward(self, x: Tensor, temb: Tensor) -> Tensor:
-        """`x (B, R, width)`, `temb (B, width)`; returns `(B, R, width)`."""
+        """``x (B, R, width)``, ``temb (B, width)``; returns ``(B, R, width)``."""
         scale, shift = self.linear(F.silu(temb))[:, None].chunk(2, dim=-1)  # (B, 1, width) each
         return plain_norm(x, NORM_EPS) * (1 + scale) + shift
 
@@ -113,9 +113,9 @@ class DiTBlock(nn.Module):
         self.ff = FeedForward(config.width)
 
     def forward(self, rows: Tensor, vl_embs: Tensor, temb: Tensor, change: BlockChange = UNCHANGED) -> Tensor:
-        """`rows (B, R, width)`, `vl_embs (B, S, context_dim)`, `temb (B, width)`; returns `(B, R, width)`.
+        """``rows (B, R, width)``, ``vl_embs (B, S, context_dim)``, ``timestep (B,)``; to ``(B, R, hidden)``.
 
-        The caller applies what `change` does after the block.
+        The caller applies what ``change`` does after the block.
         """
         y = self.norm1(rows, temb)
         attended, weights = self.attn1(
@@ -140,7 +140,7 @@ class TimestepEmbedder(nn.Module):
         self.linear_2 = nn.Linear(width, width)
 
     def forward(self, x: Tensor) -> Tensor:
-        """`(B, 256)` to `(B, width)`."""
+        """``(B, 256)`` to ``(B, width)``."""
         return self.linear_2(F.silu(self.linear_1(x)))
 
 
@@ -152,7 +152,7 @@ class TimestepEncoder(nn.Module):
         self.timestep_embedder = TimestepEmbedder(width)
 
     def forward(self, timestep: Tensor) -> Tensor:
-        """Buckets `(B,)` to `(B, width)`."""
+        """Buckets ``(B,)`` to ``(B, width)``."""
         dtype = self.timestep_embedder.linear_1.weight.dtype
         return self.timestep_embedder(tables.timestep_table(timestep).to(dtype))
 
@@ -172,9 +172,9 @@ class DiffusionTransformer(nn.Module):
     def forward(
         self, rows: Tensor, vl_embs: Tensor, timestep: Tensor, changes: Iterable[BlockChange]
     ) -> Tensor:
-        """`rows (B, R, width)`, `vl_embs (B, S, context_dim)`, `timestep (B,)`; to `(B, R, hidden_dim)`.
+        """``rows (B, R, width)``, ``vl_embs (B, S, context_dim)``, ``temb (B, width)``; to ``rows``' shape.
 
-        `changes` has one entry for each block.
+        ``changes`` has one entry for each block.
         """
         temb = self.timestep_encoder(timestep)  # (B, width)
         for block, change in zip(self.transformer_blocks, changes, strict=True):
@@ -188,7 +188,7 @@ class DiffusionTransformer(nn.Module):
 
 
 class CategoryLinear(nn.Module):
-    """One linear layer per embodiment. Weights are stored as `(category, in, out)`, not transposed."""
+    """One linear layer per embodiment. Weights are stored as ``(category, in, out)``, not transposed."""
 
     def __init__(self, num_categories: int, in_features: int, out_features: int) -> None:
         super().__init__()
@@ -196,7 +196,7 @@ class CategoryLinear(nn.Module):
         self.b = nn.Parameter(torch.zeros(num_categories, out_features))
 
     def forward(self, x: Tensor, embodiment_id: int | Tensor) -> Tensor:
-        """`x (B, rows, in_features)`, an int or `(B,)`; returns `(B, rows, out_features)`."""
+        """``x (B, rows, in_features)``, an int or ``(B,)``; returns ``(B, rows, out_features)``."""
         if isinstance(embodiment_id, int):
             return x @ self.W[embodiment_id] + self.b[embodiment_id]
         return torch.bmm(x, self.W[embodiment_id]) + self.b[embodiment_id][:, None]
@@ -211,7 +211,7 @@ class CategoryMlp(nn.Module):
         self.layer2 = CategoryLinear(num_categories, hidden_dim, out_features)
 
     def forward(self, x: Tensor, embodiment_id: int | Tensor) -> Tensor:
-        """`(B, rows, in_features)` to `(B, rows, out_features)`."""
+        """``(B, rows, in_features)`` to ``(B, rows, out_features)``."""
         return self.layer2(F.relu(self.layer1(x, embodiment_id)), embodiment_id)
 
 
@@ -226,7 +226,7 @@ class ActionEncoder(nn.Module):
         self.W3 = CategoryLinear(num_categories, width, width)
 
     def forward(self, actions: Tensor, timestep: Tensor, embodiment_id: int | Tensor) -> Tensor:
-        """`actions (B, T, action_dim)`, `timestep (B,)`; returns `(B, T, width)`."""
+        """``actions (B, T, action_dim)``, ``timestep (B,)``; returns ``(B, T, width)``."""
         a = self.W1(actions, embodiment_id)  # (B, T, width)
         tau = tables.action_time_table(timestep, self.width).to(a.dtype)  # (B, width)
         z = torch.cat((a, tau[:, None].expand_as(a)), dim=-1)  # (B, T, 2 width)
@@ -234,5 +234,5 @@ class ActionEncoder(nn.Module):
 
 
 def token_table(num_rows: int, width: int) -> nn.Embedding:
-    """Learned rows, `(num_rows, width)`. There may be none."""
+    """Learned rows, ``(num_rows, width)``. There may be none."""
     return nn.Embedding(num_rows, width, _weight=TABLE_STD * torch.randn(num_rows, width))

@@ -14,7 +14,7 @@ def eagle(module: ModuleType, sizes: BackboneSizes) -> Any:
     """A model with the weights that torch gives it.
 
     Args:
-        module: lerobot's ``modeling_eagle2_5_vl``.
+        module: Lerobot's ``modeling_eagle2_5_vl``.
         sizes: Sizes of the backbone.
     """
     vision = {

@@ -4,7 +4,7 @@ The packages of lerobot import datasets, cameras and robots, whereas the head ne
 transformers. Therefore its three files are imported under their own names inside empty packages, which are
 removed afterwards.
 
-Install it with `pip install --no-deps lerobot==0.4.4` and `pip install "diffusers~=0.35.0"
+Install it with ``pip install --no-deps lerobot==0.4.4`` and `pip install "diffusers~=0.35.0"
 "transformers~=4.57.0"`.
 """
 
@@ -33,15 +33,15 @@ HEAD = "lerobot.policies.groot.action_head.flow_matching_action_head"
 
 
 def build(config: Mapping[str, Any], *, device: str = "cpu") -> nn.Module:
-    """A `FlowmatchingActionHead` in evaluation mode, initialised by the released code.
+    """A ``FlowmatchingActionHead`` in evaluation mode, initialised by the released code.
 
     Args:
-        config: the config of a head in the released names, or of a whole checkpoint.
-        device: where it is created. On `"meta"` no time is spent on weights that are replaced later.
+        config: The config of a head in the released names, or of a whole checkpoint.
+        device: Where it is created. On ``"meta"`` no time is spent on weights that are replaced later.
 
     Raises:
-        MissingExtraError: lerobot is not installed.
-        ModuleNotFoundError: diffusers or transformers is not installed.
+        MissingExtraError: Lerobot is not installed.
+        ModuleNotFoundError: Diffusers or transformers is not installed.
     """
     module = import_head()
     head_config = dict(config.get("action_head_cfg", config))
@@ -60,17 +60,17 @@ def build(config: Mapping[str, Any], *, device: str = "cpu") -> nn.Module:
 def get_action(
     head: nn.Module, backbone_features: Tensor, state: Tensor, embodiment_id: Tensor, noise: Tensor
 ) -> Tensor:
-    """Calls `get_action` of the head with the given noise.
+    """Calls ``get_action`` of the head with the given noise.
 
     Args:
-        head: the head that `build` returned.
-        backbone_features: `(batch, T_vl, context_dim)`.
-        state: `(batch, 1, state_dim)`.
-        embodiment_id: `(batch,)` long.
-        noise: `(batch, horizon, action_dim)`, used in place of the noise that it would draw.
+        head: The head that ``build`` returned.
+        backbone_features: ``(batch, T_vl, context_dim)``.
+        state: ``(batch, 1, state_dim)``.
+        embodiment_id: ``(batch,)`` long.
+        noise: ``(batch, horizon, action_dim)``, used in place of the noise that it would draw.
 
     Returns:
-        `(batch, horizon, action_dim)`.
+        ``(batch, horizon, action_dim)``.
     """
     batch_feature = import_head().BatchFeature
     backbone = batch_feature(data={"backbone_features": backbone_features})
@@ -86,7 +86,7 @@ def get_action(
 
 
 def import_head() -> ModuleType:
-    """The module of `FlowmatchingActionHead`."""
+    """The module of ``FlowmatchingActionHead``."""
     if HEAD in sys.modules:
         return sys.modules[HEAD]
     spec = importlib.util.find_spec("lerobot")

@@ -20,7 +20,7 @@ SCALE_SUFFIX = "_scale"
 def described(
     source: str | PathLike[str], config: Mapping[str, Any] | str | PathLike[str] | None = None
 ) -> Description:
-    """As `saccade.checkpoints.describe`, but the config may also be in the metadata of a single file."""
+    """As ``saccade.checkpoints.describe``, but the config may also be in the metadata of a single file."""
     path = Path(source)
     if config is None and path.is_file() and not (path.parent / "config.json").is_file():
         with safe_open(path, framework="pt") as opened:
@@ -39,11 +39,11 @@ def tensor_names(checkpoint: Description) -> list[str]:
 def read_tensors(
     checkpoint: Description, expected: Mapping[str, torch.Size], dtype: torch.dtype
 ) -> dict[str, Tensor]:
-    """Reads the head's tensors in `dtype`, by their names without prefix. int8 weights are multiplied by
+    """Reads the head's tensors in ``dtype``, by their names without prefix. int8 weights are multiplied by
     their scales.
 
     Raises:
-        CheckpointError: tensors are missing, unknown inside the prefix, or of the wrong shape. The message
+        CheckpointError: Tensors are missing, unknown inside the prefix, or of the wrong shape. The message
             lists all of them.
     """
     prefix = checkpoint.prefix

@@ -59,15 +59,15 @@ def write_checkpoint(
     through: torch.dtype = torch.float32,
     shard_bytes: int = 2**28,
 ) -> None:
-    """Writes the tensors of `random_head(config, seed)` as a checkpoint in the published layout.
+    """Writes the tensors of ``random_head(config, seed)`` as a checkpoint in the published layout.
 
     Args:
-        folder: the directory of `config.json` and `model-*.safetensors`.
-        config: the config of the head in the released names.
-        seed: seed of the weights.
-        dtype: dtype of the stored tensors.
-        through: dtype that they are rounded to first, so that files in two dtypes can have equal values.
-        shard_bytes: a shard is complete when it reaches this size.
+        folder: The directory of ``config.json`` and ``model-*.safetensors``.
+        config: The config of the head in the released names.
+        seed: Seed of the weights.
+        dtype: Dtype of the stored tensors.
+        through: Dtype that they are rounded to first, so that files in two dtypes can have equal values.
+        shard_bytes: A shard is complete when it reaches this size.
     """
     with torch.device("meta"):
         head = ActionHead(HeadConfig.from_dict(config), unused=unused_parameters(config))
@@ -86,12 +86,12 @@ def write_checkpoint(
 
 
 def random_tensor(name: str, shape: torch.Size, generator: torch.Generator) -> Tensor:
-    """One tensor of `random_head` in float32, scaled so that activations stay of order one.
+    """One tensor of ``random_head`` in float32, scaled so that activations stay of order one.
 
     Args:
-        name: name in the checkpoint, which distinguishes weights, biases, norms and tables.
-        shape: shape of the tensor.
-        generator: advances.
+        name: Name in the checkpoint, which distinguishes weights, biases, norms and tables.
+        shape: Shape of the tensor.
+        generator: Advances.
     """
     drawn = torch.randn(shape, generator=generator)
     if name.endswith((".bias", ".b")) or not shape:
@@ -109,14 +109,14 @@ def random_inputs(config: HeadConfig, seed: int, *, batch: int, num_vl_tokens: i
     """Standard normal inputs, one random embodiment per row, and masks if the head needs them.
 
     Args:
-        config: config of the head.
-        seed: seed of all inputs.
-        batch: number of observations.
+        config: Config of the head.
+        seed: Seed of all inputs.
+        batch: Number of observations.
         num_vl_tokens: T_vl.
 
     Returns:
-        Arguments of `ActionHead.forward`: `backbone_features`, `state`, `noise` in float32, `embodiment_id`
-        long. With alternate masks also those of `random_masks`.
+        Arguments of ``ActionHead.forward``: ``backbone_features``, ``state``, ``noise`` in float32,
+        ``embodiment_id`` long. With alternate masks also those of ``random_masks``.
     """
     generator = torch.Generator().manual_seed(seed)
     inputs = {
@@ -134,12 +134,12 @@ def random_masks(generator: torch.Generator, *, batch: int, num_vl_tokens: int) 
     """Padding on the left and a sequence of image tokens, of different lengths in every row.
 
     Args:
-        generator: advances.
-        batch: number of observations.
+        generator: Advances.
+        batch: Number of observations.
         num_vl_tokens: T_vl, at least 2, since each row has an attended text and an attended image token.
 
     Returns:
-        `attention_mask` and `image_mask`, bool `(batch, T_vl)`.
+        ``attention_mask`` and ``image_mask``, bool ``(batch, T_vl)``.
     """
 
     def draw(high: int) -> int:

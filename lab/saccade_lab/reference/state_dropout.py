@@ -37,6 +37,6 @@ def check_probabilities(probabilities: Tensor) -> None:
 
 
 def seen_state(state: Tensor, probabilities: Tensor, embodiment_id: int | Tensor) -> Tensor:
-    """`state (B, rows, width)` with zeros for the embodiments that training always dropped it for."""
+    """``state (B, rows, width)`` with zeros for the embodiments that training always dropped it for."""
     dropped = probabilities.float()[embodiment_id] > ALWAYS  # () or (B,)
     return torch.where(dropped.reshape(-1, 1, 1), torch.zeros_like(state), state)

@@ -17,7 +17,7 @@ LOG_SIGMA = "task_log_sigma."  # the fork: learned weights of its decoders' loss
 
 @dataclass(frozen=True)
 class TimeDistribution:
-    """The distribution of flow times in training: `scale * (1 - b)` with `b ~ Beta(alpha, beta)`.
+    """The distribution of flow times in training: ``scale * (1 - b)`` with ``b ~ Beta(alpha, beta)``.
 
     This is the form of the later releases. Times are in [0, scale], and most are near 0, where the actions
     are mostly noise.
@@ -29,7 +29,7 @@ class TimeDistribution:
 
     @classmethod
     def from_dict(cls, config: Mapping[str, Any]) -> "TimeDistribution":
-        """Reads `noise_beta_alpha`, `noise_beta_beta` and `noise_s`. Defaults are the released values."""
+        """Reads ``noise_beta_alpha``, ``noise_beta_beta`` and ``noise_s``, by default the released values."""
         head = config.get("action_head_cfg", config)
         return cls(
             alpha=float(head.get("noise_beta_alpha", cls.alpha)),
@@ -38,7 +38,7 @@ class TimeDistribution:
         )
 
     def draw(self, batch: int, generator: torch.Generator | None = None) -> np.ndarray:
-        """Draws `(batch,)` float64 times."""
+        """Draws ``(batch,)`` float64 times."""
         # torch's Beta accepts no generator, so the generator seeds NumPy's.
         seed = int(torch.randint(2**63 - 1, (), generator=generator))
         drawn = np.random.default_rng(seed).beta(self.alpha, self.beta, size=batch)
@@ -48,11 +48,11 @@ class TimeDistribution:
 def flow_matching_error(
     predicted: Tensor, actions: Tensor, noise: Tensor, action_mask: Tensor | None
 ) -> Tensor:
-    """The mean squared error of a velocity, which should be `actions - noise`.
+    """The mean squared error of a velocity, which should be ``actions - noise``.
 
     Args:
-        predicted, actions, noise: `(B, T, action_dim)`.
-        action_mask: weights, broadcast to `(B, T, action_dim)`; None weighs all equally.
+        predicted, actions, noise: ``(B, T, action_dim)``.
+        action_mask: Weights, broadcast to ``(B, T, action_dim)``; None weighs all equally.
 
     Returns:
         A scalar.

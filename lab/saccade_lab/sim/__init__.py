@@ -1,6 +1,6 @@
 """Simulated robot tasks with camera images, and the small policy that solves them.
 
-Importing this package registers a gymnasium environment for each task of `saccade_lab.sim.tasks`:
+Importing this package registers a gymnasium environment for each task of ``saccade_lab.sim.tasks``:
 
     >>> import gymnasium, saccade_lab.sim
     >>> env = gymnasium.make("saccade/drawer-open-v0")
@@ -9,12 +9,12 @@ Importing this package registers a gymnasium environment for each task of `sacca
     ((68, 68, 3), (4,), 'open the drawer')
     >>> env.close()
 
-Modules: `tasks` (instructions, seeds), `scenarios` (layouts, success, experts' actions), `cameras`,
-`environment` (observations and actions), `graphics` and `rendering` (OpenGL), `experts` and `demos`
-(demonstrations), `settings` (the files of a policy), `policy` and `torch_engine` (a whole policy in the
-simulator), `dataset`, `learner`, `training_settings` and `train` (training in torch), `rollout`, `episodes`,
-`environment_cache`, `report` and `video` (closed loop), `lerobot` (lerobot's keys). Needs the extra `sim`.
-Opens no window.
+Modules: ``tasks`` (instructions, seeds), ``scenarios`` (layouts, success, experts' actions), ``cameras``,
+``environment`` (observations and actions), ``graphics`` and ``rendering`` (OpenGL), ``experts`` and ``demos``
+(demonstrations), ``settings`` (the files of a policy), ``policy`` and ``torch_engine`` (a whole policy in the
+simulator), ``dataset``, ``learner``, ``training_settings`` and ``train`` (training in torch), ``rollout``,
+``episodes``, ``environment_cache``, ``report`` and ``video`` (closed loop), ``lerobot`` (lerobot's keys).
+Needs the extra ``sim``. Opens no window.
 """
 
 from saccade_lab.sim import graphics
@@ -24,7 +24,7 @@ graphics.choose_backend()  # MuJoCo reads the choice once, when it is imported
 
 
 def register_environments() -> None:
-    """Registers `saccade/<task>-v0` with gymnasium, if it is installed."""
+    """Registers ``saccade/<task>-v0`` with gymnasium, if it is installed."""
     try:
         import gymnasium
     except ModuleNotFoundError:  # `policy` needs NumPy only

@@ -5,7 +5,7 @@ from __future__ import annotations
 import ctypes
 import platform
 
-#: Of glibc's `malloc.h`: how much free memory may stay (-1: all), and how many blocks may be mapped singly.
+#: Of glibc's ``malloc.h``: how much free memory may stay (-1: all), and how many blocks may be mapped singly.
 M_TRIM_THRESHOLD, M_MMAP_MAX = -1, -4
 
 

@@ -1,4 +1,4 @@
-"""The positions of the cameras: plain numbers, stored in a policy's config. `rendering` draws with them."""
+"""The positions of the cameras: plain numbers, stored in a policy's config. ``rendering`` draws with them."""
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
@@ -25,7 +25,7 @@ class CameraPose:
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> "CameraPose":
-        """Reads what `to_dict` wrote."""
+        """Reads what ``to_dict`` wrote."""
         x, y, z = (float(value) for value in values["lookat"])
         numbers = {key: float(values[key]) for key in ("distance", "azimuth", "elevation")}
         return cls(name=str(values["name"]), lookat=(x, y, z), **numbers)

@@ -1,8 +1,9 @@
 """Demonstrations: scripted experts recorded with the policy's cameras, one file per episode.
 
-A recording is a directory with `<task>/<seed>.npz` and `<task>/recording.json`, which has the settings. Files
-are written under a temporary name and renamed, so that an interrupted recording can be continued. An episode
-depends only on its task, its seed and the settings, so that several processes record the same files as one.
+A recording is a directory with ``<task>/<seed>.npz`` and ``<task>/recording.json``, which has the settings.
+Files are written under a temporary name and renamed, so that an interrupted recording can be continued. An
+episode depends only on its task, its seed and the settings, so that several processes record the same files
+as one.
 """
 
 from __future__ import annotations
@@ -63,22 +64,22 @@ class RecordingSettings:
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> RecordingSettings:
-        """Reads what `to_dict` wrote."""
+        """Reads what ``to_dict`` wrote."""
         cameras = tuple(CameraPose.from_dict(camera) for camera in values["cameras"])
         return cls(int(values["image_size"]), int(values["frame_stride"]), cameras)
 
 
 @dataclass(frozen=True)
 class Demonstration:
-    """One recorded episode of `steps` control steps and `frames` observations.
+    """One recorded episode of ``steps`` control steps and ``frames`` observations.
 
     Attributes:
-        images: `(frames, cameras, H, W, 3)` uint8.
-        proprio: `(frames, 4)` float32.
-        targets: `(frames, 6)` float32, positions of object and goal, metres.
-        frame_steps: `(frames,)` int32, the control step before which a frame was drawn.
-        actions: `(steps, 4)` float32, the expert's action at each step.
-        disturbed: `(steps,)` bool, where another action was executed.
+        images: ``(frames, cameras, H, W, 3)`` uint8.
+        proprio: ``(frames, 4)`` float32.
+        targets: ``(frames, 6)`` float32, positions of object and goal, metres.
+        frame_steps: ``(frames,)`` int32, the control step before which a frame was drawn.
+        actions: ``(steps, 4)`` float32, the expert's action at each step.
+        disturbed: ``(steps,)`` bool, where another action was executed.
     """
 
     images: npt.NDArray[np.uint8]
@@ -182,7 +183,7 @@ class Seeds:
         """Seeds that one process would certainly try next: as many as episodes are missing.
 
         Args:
-            on_episode: called for each episode that an earlier run recorded.
+            on_episode: Called for each episode that an earlier run recorded.
         """
         found: list[int] = []
         for seed in self._left if self.done < self.count else ():
@@ -202,7 +203,7 @@ class Seeds:
         return self.directory / f"{seed}.npz"
 
     def check(self) -> None:
-        """Raises `InputError` if the expert fails too often, judged in the order of the seeds."""
+        """Raises ``InputError`` if the expert fails too often, judged in the order of the seeds."""
         succeeded = 0
         for tried, outcome in enumerate(self.outcomes.values(), start=1):
             if outcome is None:
@@ -222,17 +223,17 @@ def record_tasks(
     """Records episodes of tasks, less those that are recorded already, in one process or in several.
 
     Args:
-        counts: number of episodes by the name of the task: those with the first seeds at which the expert
+        counts: Number of episodes by the name of the task: those with the first seeds at which the expert
             succeeds.
-        out: directory of the whole recording.
-        settings: must be the same as those of earlier episodes in `out`.
-        on_episode: called with the task after each episode, recorded now or earlier.
-        workers: the processes. Files and episodes are the same with any of them.
+        out: Directory of the whole recording.
+        settings: Must be the same as those of earlier episodes in ``out``.
+        on_episode: Called with the task after each episode, recorded now or earlier.
+        workers: The processes. Files and episodes are the same with any of them.
 
     Raises:
-        InputError: `out` was recorded with other settings, or the expert fails too often.
+        InputError: ``out`` was recorded with other settings, or the expert fails too often.
         GraphicsError: OpenGL cannot be loaded.
-        SaccadeError: processes died again and again; the other episodes are recorded.
+        SaccadeError: Processes died again and again; the other episodes are recorded.
     """
     tasks = {task: Seeds(task, count, out / task) for task, count in counts.items()}
     for task in tasks.values():
@@ -268,7 +269,7 @@ def record_tasks(
 def record_task(
     task: str, count: int, out: Path, settings: RecordingSettings, on_episode: Callable[[], None]
 ) -> None:
-    """Records `count` episodes of one task in this process; see `record_tasks`."""
+    """Records ``count`` episodes of one task in this process; see ``record_tasks``."""
     record_tasks({task: count}, out, settings, lambda task: on_episode())
 
 
@@ -285,7 +286,7 @@ def claim_directory(path: Path, settings: RecordingSettings) -> None:
 
 
 def load(path: Path, *, images: bool = True) -> Demonstration:
-    """Reads one episode, with or without its images. Without, `images` is `(frames, 0, 0, 0, 3)`."""
+    """Reads one episode, with or without its images. Without, ``images`` is ``(frames, 0, 0, 0, 3)``."""
     with np.load(path, allow_pickle=False) as arrays:  # reads an array when it is asked for
         names = [name for name in Demonstration.__dataclass_fields__ if images or name != "images"]
         found = {name: arrays[name] for name in names}
@@ -293,10 +294,10 @@ def load(path: Path, *, images: bool = True) -> Demonstration:
 
 
 def recorded_tasks(directory: Path) -> list[str]:
-    """Tasks with a recording in the directory, in the order of `TASKS`.
+    """Tasks with a recording in the directory, in the order of ``TASKS``.
 
     Raises:
-        FileNotFoundError: there is none.
+        FileNotFoundError: There is none.
     """
     tasks = [name for name in TASKS if (directory / name / "recording.json").is_file()]
     if not tasks:
@@ -308,7 +309,7 @@ def read_settings(directory: Path, tasks: Sequence[str]) -> RecordingSettings:
     """The settings that all tasks of a recording share.
 
     Raises:
-        InputError: they differ.
+        InputError: They differ.
     """
     found = [json.loads((directory / name / "recording.json").read_text()) for name in tasks]
     if any(settings != found[0] for settings in found):
@@ -317,6 +318,6 @@ def read_settings(directory: Path, tasks: Sequence[str]) -> RecordingSettings:
 
 
 def episodes(directory: Path, task: str, *, images: bool = True) -> Iterator[tuple[int, Demonstration]]:
-    """Seeds and episodes of a task, in the order of their seeds, with or without images as in `load`."""
+    """Seeds and episodes of a task, in the order of their seeds, with or without images as in ``load``."""
     for path in sorted((directory / task).glob("[0-9]*.npz"), key=lambda path: int(path.stem)):
         yield int(path.stem), load(path, images=images)

@@ -31,21 +31,21 @@ class TaskEnvironment(gymnasium.Env[SimulatedObservation, npt.NDArray[np.float32
 
     An observation contains what a real robot would have: images, proprioception and the instruction. It does
     not contain positions of objects and goals; experts and training targets get them from
-    `privileged_state`.
+    ``privileged_state``.
 
-    Create it by name, `gymnasium.make("saccade/reach-v0")`, after `import saccade_lab.sim`. The same seed
+    Create it by name, ``gymnasium.make("saccade/reach-v0")``, after ``import saccade_lab.sim``. The same seed
     gives
-    the same layout, wording and pixels. An episode ends (`terminated`) at its first success.
+    the same layout, wording and pixels. An episode ends (``terminated``) at its first success.
 
     Args:
-        task: its name, see `saccade_lab.sim.tasks`.
-        image_size: pixels along each side.
-        cameras: those of the policy.
-        blanked: names of cameras whose images are black, to test what the policy does without them.
-        render_mode: `"rgb_array"` lets `render` draw the whole robot for videos.
+        task: Its name, see ``saccade_lab.sim.tasks``.
+        image_size: Pixels along each side.
+        cameras: Those of the policy.
+        blanked: Names of cameras whose images are black, to test what the policy does without them.
+        render_mode: ``"rgb_array"`` lets ``render`` draw the whole robot for videos.
 
     Raises:
-        InputError: unknown task, unusable image size or cameras, or a blanked name without a camera.
+        InputError: Unknown task, unusable image size or cameras, or a blanked name without a camera.
         GraphicsError: OpenGL cannot be loaded.
 
     Example:
@@ -112,14 +112,14 @@ class TaskEnvironment(gymnasium.Env[SimulatedObservation, npt.NDArray[np.float32
         return self.observe(), {"success": False, "task": self.task.name}
 
     def step(self, action: npt.ArrayLike) -> tuple[SimulatedObservation, float, bool, bool, dict[str, Any]]:
-        """Applies one action `(4,)`, clipped to [-1, 1]; `info["success"]` says whether the task is done."""
+        """Applies one action ``(4,)``, clipped to [-1, 1]; ``info["success"]``: whether the task is done."""
         outcome = self.advance(action)
         truncated = self._steps >= self.task.max_steps and not outcome.success
         info = {"success": outcome.success, "task": self.task.name}
         return self.observe(), outcome.reward, outcome.success, truncated, info
 
     def restart(self, seed: int) -> None:
-        """Like `reset`, without drawing an observation."""
+        """Like ``reset``, without drawing an observation."""
         self.instruction = self.task.instruction(seed)
         self._world.seed(seed)
         self._full_state, _ = self._world.reset()
@@ -130,13 +130,13 @@ class TaskEnvironment(gymnasium.Env[SimulatedObservation, npt.NDArray[np.float32
         self._steps = 0
 
     def advance(self, action: npt.ArrayLike) -> StepOutcome:
-        """Like `step`, without drawing an observation, which policies need only once per chunk.
+        """Like ``step``, without drawing an observation, which policies need only once per chunk.
 
         Args:
-            action: `(4,)`, clipped to [-1, 1].
+            action: ``(4,)``, clipped to [-1, 1].
 
         Raises:
-            ShapeError, InputError: `action` has another shape, or is not finite.
+            ShapeError, InputError: ``action`` has another shape, or is not finite.
         """
         action = np.asarray(action, dtype=np.float64)
         if action.shape != (ACTION_DIM,):
@@ -148,7 +148,7 @@ class TaskEnvironment(gymnasium.Env[SimulatedObservation, npt.NDArray[np.float32
         return self.scenario.outcome(float(reward), bool(info["success"]))
 
     def observe(self) -> SimulatedObservation:
-        """The current observation; also stored as `last_observation`."""
+        """The current observation; also stored as ``last_observation``."""
         self.last_observation = {
             "images": {camera.name: self._picture(camera) for camera in self.cameras},
             "proprio": self._full_state[:PROPRIO_DIM].astype(np.float32),
@@ -165,7 +165,7 @@ class TaskEnvironment(gymnasium.Env[SimulatedObservation, npt.NDArray[np.float32
         return self._renderer.draw(self._world.data, camera, self.scenario.balls())
 
     def render(self) -> UInt8Array | None:
-        """The whole robot from the side, `(360, 360, 3)`, if `render_mode` is `"rgb_array"`."""
+        """The whole robot from the side, ``(360, 360, 3)``, if ``render_mode`` is ``"rgb_array"``."""
         if self.render_mode is None:
             return None
         if self._video_renderer is None:
@@ -173,18 +173,18 @@ class TaskEnvironment(gymnasium.Env[SimulatedObservation, npt.NDArray[np.float32
         return self._video_renderer.draw(self._world.data, VIDEO_CAMERA, self.scenario.balls())
 
     def privileged_state(self) -> npt.NDArray[np.float64]:
-        """Meta-World's own observation `(39,)`, goal included. For experts; never for a policy."""
+        """Meta-World's own observation ``(39,)``, goal included. For experts; never for a policy."""
         return self._full_state.copy()
 
     def privileged_targets(self) -> npt.NDArray[np.float32]:
-        """Positions of the object and of the goal `(6,)`, metres: training targets, never an input.
+        """Positions of the object and of the goal ``(6,)``, metres: training targets, never an input.
 
         In tasks with balls these are the first and the last ball, also after they have vanished.
         """
         return self.scenario.targets(self._full_state).astype(np.float32)
 
     def fingertips(self) -> npt.NDArray[np.float64]:
-        """The point between the fingertips `(3,)`, metres, which decides the success of a reach."""
+        """The point between the fingertips ``(3,)``, metres, which decides the success of a reach."""
         return np.asarray(self._world.tcp_center, dtype=np.float64).copy()
 
     def close(self) -> None:
@@ -201,7 +201,7 @@ def make_world(scene: str) -> Any:
 
     Raises:
         GraphicsError: OpenGL cannot be loaded.
-        ModuleNotFoundError: mujoco or metaworld is not installed.
+        ModuleNotFoundError: Mujoco or metaworld is not installed.
     """
     graphics.load_mujoco()  # metaworld imports it too, with a less helpful error where OpenGL is missing
     from metaworld.env_dict import ALL_V3_ENVIRONMENTS
@@ -210,7 +210,7 @@ def make_world(scene: str) -> Any:
 
 
 def observation_space(cameras: Sequence[CameraPose], image_size: int) -> spaces.Dict:
-    """The space of `TaskEnvironment.observe`."""
+    """The space of ``TaskEnvironment.observe``."""
     shape = (image_size, image_size, 3)
     return spaces.Dict(
         {

@@ -1,4 +1,4 @@
-"""Episodes as independent work items, for `saccade rollout` in one process or in many."""
+"""Episodes as independent work items, for ``saccade rollout`` in one process or in many."""
 
 from __future__ import annotations
 
@@ -40,11 +40,11 @@ class Episodes:
 
     Attributes:
         checkpoint: Directory of the policy.
-        engine: What computes backbone and head, `"rust"` or `"torch"`.
+        engine: What computes backbone and head, ``"rust"`` or ``"torch"``.
         num_threads: Threads of the policy; None for its default.
         instruction_from: A task whose instruction the policy gets instead.
         video: Whether a video is made of each episode.
-        data_config, action_horizon: As `saccade.Policy.from_pretrained` takes them.
+        data_config, action_horizon: As ``saccade.Policy.from_pretrained`` takes them.
         processor_options: The same, as JSON.
     """
 
@@ -59,7 +59,7 @@ class Episodes:
 
     @property
     def overrides(self) -> dict[str, Any]:
-        """What is given of `data_config`, `action_horizon` and `processor_options`, as JSON values."""
+        """What is given of ``data_config``, ``action_horizon`` and ``processor_options``, as JSON values."""
         options = None if self.processor_options is None else json.loads(self.processor_options)
         found = {
             "data_config": self.data_config,
@@ -70,7 +70,7 @@ class Episodes:
 
     @property
     def policy(self) -> Policy:
-        """The policy. The first call in a process loads it; raises as `Policy.from_pretrained`."""
+        """The policy. The first call in a process loads it; raises as ``Policy.from_pretrained``."""
         return policy_of(self.checkpoint, self.engine, self.num_threads, json.dumps(self.overrides))
 
     def __call__(self, item: tuple[str, int]) -> Rolled:
@@ -88,7 +88,7 @@ class Episodes:
         return Rolled(episode, tile(picture), video)
 
     def _run(self, environment: TaskEnvironment, seed: int, **options: Any) -> Episode:
-        """The episode; options as `run_episode`."""
+        """The episode; options as ``run_episode``."""
         return rollout.run_episode(
             environment, self.policy, seed, instruction_from=self.instruction_from, **options
         )

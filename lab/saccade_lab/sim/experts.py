@@ -18,14 +18,14 @@ class Expert:
     """The scripted expert of one task, which knows the full state.
 
     Args:
-        environment: the simulation that it acts in.
+        environment: The simulation that it acts in.
     """
 
     def __init__(self, environment: TaskEnvironment) -> None:
         self._environment = environment
 
     def action(self) -> Float32Array:
-        """Its action in the current state, `(4,)` in [-1, 1]."""
+        """Its action in the current state, ``(4,)`` in [-1, 1]."""
         action = self._environment.scenario.expert_action(self._environment.privileged_state())
         clipped: Float32Array = np.clip(action[:ACTION_DIM], -1.0, 1.0).astype(np.float32)
         return clipped

@@ -1,7 +1,7 @@
 """OpenGL without a window: the backend that MuJoCo draws with, and whether it works on this machine.
 
 MuJoCo loads OpenGL when it is imported. Modules of this package therefore import MuJoCo when they first need
-it, through `load_mujoco`: what draws nothing (training, reports, reading recordings) runs without OpenGL.
+it, through ``load_mujoco``: what draws nothing (training, reports, reading recordings) runs without OpenGL.
 """
 
 import functools
@@ -44,9 +44,9 @@ class GraphicsError(SaccadeError):
 def choose_backend() -> None:
     """Selects EGL unless the user chose a backend, and keeps Mesa's software renderer on the calling thread.
 
-    Sets the environment variables `MUJOCO_GL`, which is read when mujoco is imported, and `LP_NUM_THREADS`,
-    which is read when the first OpenGL context is created. At 64 pixels additional drawing threads cost more
-    time than they save.
+    Sets the environment variables ``MUJOCO_GL``, which is read when mujoco is imported, and
+    ``LP_NUM_THREADS``, which is read when the first OpenGL context is created. At 64 pixels additional
+    drawing threads cost more time than they save.
     """
     os.environ.setdefault("MUJOCO_GL", "egl")
     os.environ.setdefault("LP_NUM_THREADS", "0")
@@ -58,7 +58,7 @@ def load_mujoco() -> ModuleType:
 
     Raises:
         GraphicsError: OpenGL cannot be loaded.
-        ModuleNotFoundError: mujoco is not installed.
+        ModuleNotFoundError: Mujoco is not installed.
     """
     choose_backend()
     try:
@@ -89,8 +89,8 @@ def check() -> None:
     """Draws one picture in another process.
 
     Raises:
-        GraphicsError: drawing failed; names the Debian packages and the cause.
-        ModuleNotFoundError: mujoco is not installed.
+        GraphicsError: Drawing failed; names the Debian packages and the cause.
+        ModuleNotFoundError: Mujoco is not installed.
     """
     if importlib.util.find_spec("mujoco") is None:
         raise ModuleNotFoundError("No module named 'mujoco'", name="mujoco")

@@ -1,6 +1,6 @@
-"""The tasks as lerobot expects environments: `pixels`, `agent_pos`, and the instruction as an attribute.
+"""The tasks as lerobot expects environments: ``pixels``, ``agent_pos``, and the instruction as an attribute.
 
-Importing this module registers `saccade/<task>-lerobot-v0` for each task:
+Importing this module registers ``saccade/<task>-lerobot-v0`` for each task:
 
     >>> import gymnasium, saccade_lab.sim.lerobot
     >>> env = gymnasium.make("saccade/push-lerobot-v0")
@@ -28,10 +28,10 @@ Actions = npt.NDArray[np.float32]
 
 
 class LeRobotObservation(gymnasium.Wrapper[dict[str, Any], Actions, SimulatedObservation, Actions]):
-    """An environment of `saccade_lab.sim` with lerobot's names.
+    """An environment of ``saccade_lab.sim`` with lerobot's names.
 
-    Observations are `{"pixels": {camera: (H, W, 3) uint8}, "agent_pos": (4,) float32}`; infos also contain
-    `is_success`. lerobot reads the instruction from the environment, not from the observation. It looks for
+    Observations are ``{"pixels": {camera: (H, W, 3) uint8}, "agent_pos": (4,) float32}``; infos also contain
+    ``is_success``. lerobot reads the instruction from the environment, not from the observation. It looks for
     it in the outermost wrapper, so no other may follow.
 
     Args:
@@ -101,7 +101,7 @@ def make(task: str, **options: Any) -> LeRobotObservation:
 
 
 def register_environments() -> None:
-    """Registers `saccade/<task>-lerobot-v0`, without other wrappers."""
+    """Registers ``saccade/<task>-lerobot-v0``, without other wrappers."""
     for name in TASKS:
         gymnasium.register(
             f"saccade/{name}-lerobot-v0",

@@ -33,19 +33,18 @@ ENGINES = ("rust", "torch")
 def load_whole(
     checkpoint: Path, engine: str = "rust", num_threads: int | None = None, **overrides: Any
 ) -> saccade.Policy:
-    """The policy of a checkpoint, computed by one of `ENGINES`.
+    """The policy of a checkpoint, computed by one of ``ENGINES``.
 
     Args:
-        checkpoint: a directory.
-        engine: `"rust"`, or `"torch"` for `saccade_lab.reference`, which needs torch.
-        num_threads: number of threads; for torch, of the whole process.
-        **overrides: `data_config`, `action_horizon` and `processor_options` of
-        `saccade.Policy.from_pretrained`; only
-            with `"rust"`.
+        checkpoint: A directory.
+        engine: ``"rust"``, or ``"torch"`` for ``saccade_lab.reference``, which needs torch.
+        num_threads: Number of threads; for torch, of the whole process.
+        **overrides: ``data_config``, ``action_horizon`` and ``processor_options`` of
+            ``saccade.Policy.from_pretrained``; only with ``"rust"``.
 
     Raises:
-        FileNotFoundError, CheckpointError: as `saccade.Policy.from_pretrained`.
-        InputError: unknown engine, `num_threads` below 1, or `overrides` with `"torch"`.
+        FileNotFoundError, CheckpointError: As ``saccade.Policy.from_pretrained``.
+        InputError: Unknown engine, ``num_threads`` below 1, or ``overrides`` with ``"torch"``.
     """
     if num_threads is not None and num_threads < 1:
         raise InputError(f"num_threads: given {num_threads}, expected at least 1")
@@ -65,7 +64,7 @@ class Chunk:
     """A chunk of actions and the time that it took.
 
     Attributes:
-        actions: `(horizon, action_dim)` float32 in [-1, 1].
+        actions: ``(horizon, action_dim)`` float32 in [-1, 1].
         milliseconds: Time of each part: backbone (with the preparation of frames and words), encode, sample.
     """
 
@@ -77,10 +76,10 @@ class Policy:
     """A whole policy that drives the simulated robot.
 
     Args:
-        whole: the policy.
-        config: how it is run in the simulator.
-        checkpoint: the directory that it was loaded from.
-        engine: which of `ENGINES` computes it.
+        whole: The policy.
+        config: How it is run in the simulator.
+        checkpoint: The directory that it was loaded from.
+        engine: Which of ``ENGINES`` computes it.
 
     Example:
         >>> import gymnasium, saccade_lab.sim
@@ -112,15 +111,15 @@ class Policy:
         """Loads a policy.
 
         Args:
-            checkpoint: a directory that `saccade train` wrote. Default: the bundled policy.
-            engine: `"rust"` or `"torch"`.
-            num_threads: number of threads.
-            **overrides: as in `load_whole`.
+            checkpoint: A directory that ``saccade train`` wrote. Default: the bundled policy.
+            engine: ``"rust"`` or ``"torch"``.
+            num_threads: Number of threads.
+            **overrides: As in ``load_whole``.
 
         Raises:
-            FileNotFoundError: a file is not there.
-            CheckpointError: config or tensors do not fit.
-            InputError: as `load_whole`.
+            FileNotFoundError: A file is not there.
+            CheckpointError: Config or tensors do not fit.
+            InputError: As ``load_whole``.
         """
         directory = Path(checkpoint)
         if not directory.is_dir():
@@ -165,17 +164,17 @@ class Policy:
         return num_vl_tokens(self.whole.processor, self.config, instruction)
 
     def noise(self, rng: np.random.Generator) -> Float32Array:
-        """The noise that a chunk starts from, `(1, horizon, action_dim)`."""
+        """The noise that a chunk starts from, ``(1, horizon, action_dim)``."""
         return rng.standard_normal((1, self.horizon, self.head.config.encoder_action_dim), dtype=np.float32)
 
     def observation(self, seen: Mapping[str, Any]) -> dict[str, Any]:
         """What the simulator shows, in Isaac-GR00T's nested form with a batch of one.
 
         Args:
-            seen: `images` by camera name `(H, W, 3)` uint8, `proprio (4,)`, `instruction`.
+            seen: ``images`` by camera name ``(H, W, 3)`` uint8, ``proprio (4,)``, ``instruction``.
 
         Raises:
-            ShapeError: a camera is missing, or `proprio` has another shape.
+            ShapeError: A camera is missing, or ``proprio`` has another shape.
         """
         missing = [camera.name for camera in self.config.cameras if camera.name not in seen["images"]]
         if missing:
@@ -196,17 +195,17 @@ class Policy:
         }
 
     def features(self, seen: Mapping[str, Any]) -> Float32Array:
-        """Backbone features of what the simulator shows, `(1, T_vl, width)`."""
+        """Backbone features of what the simulator shows, ``(1, T_vl, width)``."""
         (found,) = features_of(self.whole, inputs_of(self.whole, self.observation(seen)))
         return np.asarray(found.backbone_features)
 
     def state(self, seen: Mapping[str, Any]) -> Float32Array:
-        """Normalised proprioception, `(1, state_dim)`."""
+        """Normalised proprioception, ``(1, state_dim)``."""
         parts = self.observation(seen)["state"].values()
         return np.asarray(self.whole.normalizer.state(np.concatenate([part[0] for part in parts], axis=-1)))
 
     def robot_actions(self, chunk: Float32Array) -> Float32Array:
-        """Actions of the head `(..., horizon, action_dim)` as the robot takes them, in [-1, 1]."""
+        """Actions of the head ``(..., horizon, action_dim)`` as the robot takes them, in [-1, 1]."""
         actions: Float32Array = np.clip(np.asarray(self.whole.normalizer.actions(chunk)), -1.0, 1.0)
         return actions
 
@@ -216,9 +215,9 @@ class Policy:
         """Computes a chunk of actions.
 
         Args:
-            seen: see `observation`.
-            noise: the result of `noise`.
-            intervention: a change inside the head, see `saccade.Intervention`.
+            seen: See ``observation``.
+            noise: The result of ``noise``.
+            intervention: A change inside the head, see ``saccade.Intervention``.
         """
         observation = self.observation(seen)
         times = [time.perf_counter()]
@@ -266,7 +265,7 @@ class Policy:
         }
 
     def checkpoint_sha256(self) -> str:
-        """SHA-256 of the policy's files, see `checkpoint_identity`."""
+        """SHA-256 of the policy's files, see ``checkpoint_identity``."""
         return checkpoint_identity(self.checkpoint)["sha256"]
 
 
@@ -281,7 +280,7 @@ def num_vl_tokens(processor: Processor, config: SimulationConfig, instruction: s
 
 
 def check_trained_on(policy: Policy, tasks: list[str]) -> None:
-    """Raises `CheckpointError` if the policy was not trained on a task."""
+    """Raises ``CheckpointError`` if the policy was not trained on a task."""
     unknown = [task for task in tasks if task not in policy.config.tasks]
     if unknown:
         raise CheckpointError(

@@ -45,8 +45,8 @@ def prepare_model(model: mujoco.MjModel, *, draws_goal: bool) -> None:
     """Configures the scene for fast drawing, in place.
 
     Args:
-        model: a Meta-World model.
-        draws_goal: whether the goal is marked with a green ball; otherwise Meta-World's marker is hidden.
+        model: A Meta-World model.
+        draws_goal: Whether the goal is marked with a green ball; otherwise Meta-World's marker is hidden.
     """
     model.vis.quality.shadowsize = 0
     model.vis.quality.offsamples = 0
@@ -61,7 +61,7 @@ def prepare_model(model: mujoco.MjModel, *, draws_goal: bool) -> None:
 
 
 def average_down(picture: UInt8Array, factor: int) -> UInt8Array:
-    """Means of `factor x factor` pixels: `(factor * H, factor * W, 3)` to `(H, W, 3)`, rounded."""
+    """Means of ``factor x factor`` pixels: ``(factor * H, factor * W, 3)`` to ``(H, W, 3)``, rounded."""
     height, width, channels = picture.shape
     blocks = picture.reshape(height // factor, factor, width // factor, factor, channels)
     total = blocks.sum(axis=(1, 3), dtype=np.uint16)  # (H, W, 3)
@@ -94,13 +94,13 @@ def add_ball(scene: mujoco.MjvScene, ball: Ball) -> None:
 class Renderer:
     """Draws one simulation through several cameras.
 
-    Call `close` to free the OpenGL context. Renderers that are still open when the interpreter ends are
+    Call ``close`` to free the OpenGL context. Renderers that are still open when the interpreter ends are
     closed then.
 
     Args:
-        model: prepared by `prepare_model`.
-        size: pixels along each side of the result.
-        for_video: draw the whole robot, and without averaging, which takes three times as long.
+        model: Prepared by ``prepare_model``.
+        size: Pixels along each side of the result.
+        for_video: Draw the whole robot, and without averaging, which takes three times as long.
 
     Raises:
         GraphicsError: OpenGL cannot be loaded.
@@ -120,10 +120,10 @@ class Renderer:
         close_all_at_exit()
 
     def draw(self, data: mujoco.MjData, camera: CameraPose, balls: Iterable[Ball] = ()) -> UInt8Array:
-        """The picture `(size, size, 3)`, with balls that the simulation does not have.
+        """The picture ``(size, size, 3)``, with balls that the simulation does not have.
 
         Raises:
-            RuntimeError: the renderer is closed.
+            RuntimeError: The renderer is closed.
         """
         if self._renderer is None:
             raise RuntimeError("this renderer is closed")

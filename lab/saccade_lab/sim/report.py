@@ -30,11 +30,11 @@ class Summary:
     """Episodes of one task, or of all.
 
     Attributes:
-        task: Its name, or `"all"`.
+        task: Its name, or ``"all"``.
         episodes, successes: How many.
         interval: 95 % interval of the success rate.
-        median_steps: Control steps to success; `None` without a success.
-        milliseconds: Mean per chunk, by part of `PARTS`.
+        median_steps: Control steps to success; ``None`` without a success.
+        milliseconds: Mean per chunk, by part of ``PARTS``.
     """
 
     task: str
@@ -80,11 +80,11 @@ def result_record(
     """The content of the result file: enough to repeat the rollout and to compare the results.
 
     Args:
-        episodes: those that were completed.
-        policy: the one that acted.
-        seeds: those that were requested, each for every task.
-        tasks: those that were requested.
-        instruction_from: the task whose instruction the policy got, if not the task's own.
+        episodes: Those that were completed.
+        policy: The one that acted.
+        seeds: Those that were requested, each for every task.
+        tasks: Those that were requested.
+        instruction_from: The task whose instruction the policy got, if not the task's own.
     """
     return {
         "complete": len(episodes) == len(seeds) * len(tasks),
@@ -109,7 +109,7 @@ def result_record(
 
 
 def tile(picture: UInt8Array) -> UInt8Array:
-    """A picture `(H, W, 3)` as the contact sheet shows it, `(TILE, TILE, 3)`."""
+    """A picture ``(H, W, 3)`` as the contact sheet shows it, ``(TILE, TILE, 3)``."""
     return np.asarray(Image.fromarray(picture).resize((TILE, TILE), Image.Resampling.BOX))
 
 
@@ -117,8 +117,8 @@ def write_contact_sheet(pictures: Sequence[tuple[Episode, UInt8Array]], path: Pa
     """Writes the last picture of every episode, a row per task, framed green for success and red for failure.
 
     Args:
-        pictures: episodes, at least one, with what `tile` returned.
-        path: path of the PNG.
+        pictures: Episodes, at least one, with what ``tile`` returned.
+        path: Path of the PNG.
     """
     tasks = list(dict.fromkeys(episode.task for episode, _ in pictures))
     rows = {task: [pair for pair in pictures if pair[0].task == task] for task in tasks}

@@ -21,10 +21,10 @@ class Episode:
         task: The task that was judged.
         seed: Seed of layout, wording and noise.
         instruction: The instruction that the policy got.
-        success: Whether the task was done within its `max_steps`.
+        success: Whether the task was done within its ``max_steps``.
         steps: Control steps until success, or until the end.
         chunks: Number of chunks that the policy computed.
-        milliseconds: Mean time per chunk over the episode, by part of `PARTS`.
+        milliseconds: Mean time per chunk over the episode, by part of ``PARTS``.
         video: Path of its video relative to the result file, if one was written.
     """
 
@@ -39,7 +39,7 @@ class Episode:
 
 
 def instruction_for(task: str, seed: int, instruction_from: str | None) -> str:
-    """The instruction of an episode; with `instruction_from`, that of another task."""
+    """The instruction of an episode; with ``instruction_from``, that of another task."""
     return find_task(instruction_from or task).instruction(seed)
 
 
@@ -52,16 +52,16 @@ def run_episode(
     intervention: Interventions | Callable[[int, int], Interventions] = None,
     on_step: Callable[[TaskEnvironment, Episode], None] = lambda environment, episode: None,
 ) -> Episode:
-    """Runs one episode to its first success or to the task's `max_steps`.
+    """Runs one episode to its first success or to the task's ``max_steps``.
 
     Args:
-        environment: an environment with the cameras and image size of the policy, see `environment_for`.
-        policy: policy that computes the chunks.
-        seed: seed of layout, wording and noise, which are the same with every engine.
-        instruction_from: a task whose instruction the policy gets instead (a control: it should then fail).
-        intervention: a change inside the head at every chunk; or a function that returns it, called with the
+        environment: An environment with the cameras and image size of the policy, see ``environment_for``.
+        policy: Policy that computes the chunks.
+        seed: Seed of layout, wording and noise, which are the same with every engine.
+        instruction_from: A task whose instruction the policy gets instead (a control: it should then fail).
+        intervention: A change inside the head at every chunk; or a function that returns it, called with the
             index of the chunk and the seed.
-        on_step: called after the first observation and after every control step, for videos.
+        on_step: Called after the first observation and after every control step, for videos.
     """
     task = environment.task
     environment.restart(seed)
@@ -93,7 +93,7 @@ def run_episode(
 def environment_for(
     policy: Policy, task: str, *, render_mode: str | None = None, blanked: Collection[str] = ()
 ) -> TaskEnvironment:
-    """The task with the policy's cameras and image size; images of the cameras in `blanked` are black."""
+    """The task with the policy's cameras and image size; images of the cameras in ``blanked`` are black."""
     return TaskEnvironment(
         task,
         image_size=policy.config.image_size,

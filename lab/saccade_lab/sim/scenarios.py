@@ -36,7 +36,7 @@ class Ball:
     """A ball that is drawn into the scene.
 
     Attributes:
-        position: Its centre `(3,)`, metres.
+        position: Its centre ``(3,)``, metres.
         radius: Its radius, metres.
         rgba: Its colour, each component in [0, 1].
     """
@@ -47,7 +47,7 @@ class Ball:
 
 
 class Scenario(Protocol):
-    """The rules of one environment. `state` is Meta-World's own observation `(39,)`, goal included."""
+    """The rules of one environment. ``state`` is Meta-World's own observation ``(39,)``, goal included."""
 
     def start(self, seed: int) -> None:
         """Creates the layout of an episode; Meta-World has already been reset with the same seed."""
@@ -59,19 +59,19 @@ class Scenario(Protocol):
         """The balls to draw into the scene now."""
 
     def targets(self, state: Float64Array) -> Float64Array:
-        """Two positions `(6,)`, metres, that a policy should locate in the images."""
+        """Two positions ``(6,)``, metres, that a policy should locate in the images."""
 
     def expert_action(self, state: Float64Array) -> Float64Array:
-        """The expert's action `(4,)`; may exceed full speed."""
+        """The expert's action ``(4,)``; may exceed full speed."""
 
 
 class MetaWorldScenario:
     """A task with the layout, success and scripted expert of Meta-World.
 
     Args:
-        world: the Meta-World environment.
-        expert: class of the expert in `metaworld.policies`.
-        aims_with_fingertips: bring the fingertips to the goal instead of the wrist. The script of reach
+        world: The Meta-World environment.
+        expert: Class of the expert in ``metaworld.policies``.
+        aims_with_fingertips: Bring the fingertips to the goal instead of the wrist. The script of reach
             brings the wrist there, but success is measured between the fingertips, 4.5 cm below. With this
             correction the whole tolerance of 5 cm is left for the errors of the learned policy.
     """
@@ -117,7 +117,7 @@ class BallScenario(ABC):
 
     Attributes:
         workspace: Lower and upper corner of the region of the balls' centres, metres. All cameras see it.
-        placed: The balls of the episode, vanished ones included. `targets` are the positions of the
+        placed: The balls of the episode, vanished ones included. ``targets`` are the positions of the
             first and the last one, which may be the same ball.
     """
 
@@ -133,7 +133,7 @@ class BallScenario(ABC):
 
     @abstractmethod
     def aim(self) -> Float64Array:
-        """The point that the expert moves the fingertips to `(3,)`, metres."""
+        """The point that the expert moves the fingertips to ``(3,)``, metres."""
 
     @abstractmethod
     def distance_left(self) -> float:
@@ -157,15 +157,15 @@ class BallScenario(ABC):
         return np.concatenate((self.placed[0].position, self.placed[-1].position))
 
     def expert_action(self, state: Float64Array) -> Float64Array:
-        """Moves straight to `aim`; the gripper is not used."""
+        """Moves straight to ``aim``; the gripper is not used."""
         return np.append(GAIN * (self.aim() - self.fingertips()), 0.0)
 
     def fingertips(self) -> Float64Array:
-        """The point between the fingertips `(3,)`, metres."""
+        """The point between the fingertips ``(3,)``, metres."""
         return np.asarray(self._world.tcp_center, dtype=np.float64)
 
     def draw_position(self, rng: np.random.Generator) -> Float64Array:
-        """A position for a ball, at least `NOT_NEARER` from the fingertips."""
+        """A position for a ball, at least ``NOT_NEARER`` from the fingertips."""
         while True:
             position = rng.uniform(*self.workspace)
             if np.linalg.norm(position - self.fingertips()) >= NOT_NEARER:
@@ -215,7 +215,7 @@ class StereoReach(BallScenario):
 
     Its radius and its height are random, so that one image gives the direction of the ball but not its
     distance. The workspace is deep: the best estimate from the ball's position and size in one image is
-    within `TOUCH` in half of the layouts; from two images it always is.
+    within ``TOUCH`` in half of the layouts; from two images it always is.
     """
 
     RADII = (0.018, 0.045)  # metres; the logarithm is uniform
@@ -324,5 +324,5 @@ class Fork(BallScenario):
         return min(self.distance(ball) for ball in self.placed[::2])
 
     def expert_action(self, state: Float64Array) -> Float64Array:
-        """Moves straight to `aim`, faster than in the other tasks; the gripper is not used."""
+        """Moves straight to ``aim``, faster than in the other tasks; the gripper is not used."""
         return np.append(self.SPEED * (self.aim() - self.fingertips()), 0.0)

@@ -36,7 +36,7 @@ CROP_SHARE = 0.95  # of each side of a frame; Isaac-GR00T's preprocessing crops 
 
 @dataclass(frozen=True)
 class SimulationConfig:
-    """How a policy is run in the simulator: `simulation_cfg` in its config.
+    """How a policy is run in the simulator: ``simulation_cfg`` in its config.
 
     Attributes:
         tasks: The tasks it was trained on.
@@ -52,11 +52,11 @@ class SimulationConfig:
 
     @classmethod
     def from_file(cls, path: Path) -> "SimulationConfig":
-        """Reads it from a `config.json`.
+        """Reads it from a ``config.json``.
 
         Raises:
-            FileNotFoundError: there is no such file.
-            CheckpointError: a key is missing, or values do not fit.
+            FileNotFoundError: There is no such file.
+            CheckpointError: A key is missing, or values do not fit.
         """
         try:
             whole = json.loads(path.read_text(encoding="utf-8"))
@@ -107,10 +107,10 @@ class PolicyConfig:
 
     Attributes:
         head: Config of the head, in the published keys.
-        backbone: Config of the backbone, in the keys of `saccade.checkpoints.published.RELEASED`.
+        backbone: Config of the backbone, in the keys of ``saccade.checkpoints.published.RELEASED``.
         simulation: How it is run in the simulator.
         words: Words that are one token each.
-        statistics: Statistics of `state` and `action`, by group, see `statistics_of`; empty before the
+        statistics: Statistics of ``state`` and ``action``, by group, see ``statistics_of``; empty before the
             demonstrations are read.
     """
 
@@ -158,7 +158,7 @@ class PolicyConfig:
             )
 
     def to_dict(self) -> dict[str, Any]:
-        """The content of `config.json`: the published keys, and `simulation_cfg`."""
+        """The content of ``config.json``: the published keys, and ``simulation_cfg``."""
         return {
             "model_type": "gr00t_n1_5",
             "architectures": ["GR00T_N1_5"],
@@ -175,14 +175,14 @@ class PolicyConfig:
         }
 
     def metadata(self) -> dict[str, Any]:
-        """The content of `experiment_cfg/metadata.json`: statistics, joints and cameras."""
+        """The content of ``experiment_cfg/metadata.json``: statistics, joints and cameras."""
         size = self.simulation.image_size
         about = {"resolution": [size, size], "channels": 3, "fps": 80.0}
         video = {camera.name: about for camera in self.simulation.cameras}
         return metadata(EMBODIMENT, self.statistics, GROUPS, video)
 
     def data_config(self) -> dict[str, Any]:
-        """The content of `experiment_cfg/data_config.json`: every group and camera, scaled by its bounds."""
+        """The content of ``experiment_cfg/data_config.json``: groups and cameras, scaled by their bounds."""
         keys = {kind: [f"{kind}.{name}" for name in GROUPS] for kind in ("state", "action")}
         return {
             "video_keys": [f"video.{camera.name}" for camera in self.simulation.cameras],
@@ -206,10 +206,10 @@ class PolicyConfig:
 
 
 def statistics_of(values: npt.NDArray[np.floating[Any]]) -> dict[str, dict[str, list[float]]]:
-    """Statistics by group, as `metadata.json` has them.
+    """Statistics by group, as ``metadata.json`` has them.
 
     Args:
-        values: `(samples, 4)`, the groups of `GROUPS` one after the other.
+        values: ``(samples, 4)``, the groups of ``GROUPS`` one after the other.
     """
     found, first = {}, 0
     for name, width in GROUPS.items():
@@ -299,14 +299,15 @@ def backbone_config(
     """A backbone config with the published keys: a small SigLIP and a small Qwen3.
 
     The tower's patches have half the side of an image token's, four of which the connector joins
-    (`use_pixel_shuffle`). A fine grid locates objects; few tokens keep the language model and the head fast.
+    (``use_pixel_shuffle``). A fine grid locates objects; few tokens keep the language model and the head
+    fast.
 
     Args:
-        width, num_layers, num_heads: of the language model.
-        vision_width, vision_layers, vision_heads: of the tower.
-        image_size: pixels along each side of a frame, before preprocessing crops it.
-        patch_size: pixels along each side of the patch behind an image token, after preprocessing.
-        words: see `PolicyConfig`.
+        width, num_layers, num_heads: Of the language model.
+        vision_width, vision_layers, vision_heads: Of the tower.
+        image_size: Pixels along each side of a frame, before preprocessing crops it.
+        patch_size: Pixels along each side of the patch behind an image token, after preprocessing.
+        words: See ``PolicyConfig``.
     """
     view = max(1, round(CROP_SHARE * image_size / patch_size)) * patch_size
     vocabulary = tokenizer(published_ids=False, words=words)["model"]["vocab"]

@@ -190,7 +190,7 @@ def find_task(name: str) -> Task:
     """The task of that name.
 
     Raises:
-        InputError: there is no such task. The message lists all tasks.
+        InputError: There is no such task. The message lists all tasks.
     """
     if name not in TASKS:
         raise InputError(f"task: unknown name {name!r}, expected one of {', '.join(TASKS)}")
@@ -198,10 +198,10 @@ def find_task(name: str) -> Task:
 
 
 def check_evaluation_seeds(first: int, count: int) -> range:
-    """The seeds `first .. first + count - 1`, checked to be evaluation seeds.
+    """The seeds ``first .. first + count - 1``, checked to be evaluation seeds.
 
     Raises:
-        InputError: `count` is below 1, or a seed belongs to demonstrations or validation.
+        InputError: ``count`` is below 1, or a seed belongs to demonstrations or validation.
     """
     if count < 1:
         raise InputError(f"episodes: given {count}, expected at least 1")

@@ -1,4 +1,4 @@
-"""The same policy in torch: `saccade_lab.reference` behind the interfaces that `saccade.Policy` uses."""
+"""The same policy in torch: ``saccade_lab.reference`` behind the interfaces that ``saccade.Policy`` uses."""
 
 # Calls of torch modules are untyped.
 # mypy: disable-error-code="no-untyped-call"
@@ -25,7 +25,7 @@ from saccade_lab.reference import ActionHead, Backbone
 
 @dataclass(frozen=True)
 class TorchContext:
-    """What the head encoded: its tokens `(batch, T_vl, context_dim)`, and which of them are removed."""
+    """What the head encoded: its tokens ``(batch, T_vl, context_dim)``, and which of them are removed."""
 
     vl_embs: torch.Tensor
     drop_vl: np.ndarray | None
@@ -42,7 +42,7 @@ class TorchContext:
 
 
 class TorchHead:
-    """`saccade_lab.reference.ActionHead` as a `saccade.policy.interfaces.Head`."""
+    """``saccade_lab.reference.ActionHead`` as a ``saccade.policy.interfaces.Head``."""
 
     def __init__(self, checkpoint: Path) -> None:
         self._head = ActionHead.from_pretrained(checkpoint)
@@ -76,13 +76,13 @@ class TorchHead:
         image_mask: ArrayLike | None = None,
         drop_vl: ArrayLike | None = None,
     ) -> Any:
-        """See `saccade.ActionHead.encode`. The other masks change nothing in N1.5, and are not read."""
+        """See ``saccade.ActionHead.encode``. The other masks change nothing in N1.5, and are not read."""
         removed = None if drop_vl is None else np.asarray(drop_vl)
         with torch.no_grad():
             return TorchContext(self._head.encode(np.asarray(backbone_features), drop_vl=removed), removed)
 
     def sample(self, context: Any, state: ArrayLike, embodiment_id: Any, **options: Any) -> Float32Array:
-        """See `saccade.ActionHead.sample`; `noise` is required, and options that are None are left out."""
+        """See ``saccade.ActionHead.sample``; ``noise`` is required, and options that are None are dropped."""
         given = {name: value for name, value in options.items() if value is not None}
         with torch.no_grad():
             found = self._head.sample(
@@ -93,14 +93,14 @@ class TorchHead:
 
 @dataclass(frozen=True)
 class TorchFeatures:
-    """Features of one observation: `(1, T_vl, width)`, and where its image tokens are, `(1, T_vl)`."""
+    """Features of one observation: ``(1, T_vl, width)``, and where its image tokens are, ``(1, T_vl)``."""
 
     backbone_features: Float32Array
     image_mask: Any
 
 
 class TorchBackbone:
-    """`saccade_lab.reference.Backbone` as `saccade.Policy` calls its backbone."""
+    """``saccade_lab.reference.Backbone`` as ``saccade.Policy`` calls its backbone."""
 
     def __init__(self, checkpoint: Path) -> None:
         self._backbone = Backbone.from_pretrained(checkpoint)
@@ -111,7 +111,7 @@ class TorchBackbone:
         return nbytes_of(self._backbone)
 
     def encode_many(self, inputs: Sequence[BackboneInputs], *, previous: Sequence[Any] = ()) -> list[Any]:
-        """See `saccade.Backbone.encode_many`. Nothing is taken from `previous`."""
+        """See ``saccade.Backbone.encode_many``. Nothing is taken from ``previous``."""
         with torch.no_grad():
             found = [self._backbone(given) for given in inputs]
         return [TorchFeatures(one.backbone_features.numpy(), one.image_mask.numpy()) for one in found]
@@ -126,8 +126,8 @@ def load_policy(checkpoint: Path, num_threads: int | None = None) -> saccade.Pol
     """The policy of a checkpoint with backbone and head in torch.
 
     Args:
-        checkpoint: a directory.
-        num_threads: threads of torch, for the whole process; None leaves torch's default.
+        checkpoint: A directory.
+        num_threads: Threads of torch, for the whole process; None leaves torch's default.
     """
     if num_threads is not None:
         torch.set_num_threads(num_threads)

@@ -25,13 +25,13 @@ GREEN, INK, PAPER = (63, 185, 80), (240, 240, 240), (24, 26, 30)
 
 
 class VideoWriter:
-    """Writes one episode as MP4, in a `with` block; the file appears when that ends without an error.
+    """Writes one episode as MP4, in a ``with`` block; the file appears when that ends without an error.
 
     Args:
-        path: path of the MP4.
+        path: Path of the MP4.
 
     Raises:
-        OSError: the video cannot be written; names `path`.
+        OSError: The video cannot be written; names ``path``.
     """
 
     def __init__(self, path: Path) -> None:
@@ -91,7 +91,7 @@ class VideoWriter:
 def compose(
     environment: TaskEnvironment, episode: Episode, font: ImageFont.FreeTypeFont | ImageFont.ImageFont
 ) -> UInt8Array:
-    """One picture of a video, `(HEIGHT, WIDTH, 3)`."""
+    """One picture of a video, ``(HEIGHT, WIDTH, 3)``."""
     canvas = Image.new("RGB", (WIDTH, HEIGHT), PAPER)
     view = environment.render()
     if view is None:

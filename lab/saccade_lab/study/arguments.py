@@ -23,14 +23,14 @@ def source_of(args: argparse.Namespace, *refused: str) -> Source:
     """Creates the source from parsed arguments.
 
     Args:
-        args: as `saccade_lab.flags.add_rollout_arguments` declares them, and for studies that take
-            pictures `add_frames`. `on_observation` is that of `PictureSource`.
-        refused: options of the study that cannot be used with recorded observations.
+        args: As ``saccade_lab.flags.add_rollout_arguments`` declares them, and for studies that take
+            pictures ``add_frames``. ``on_observation`` is that of ``PictureSource``.
+        refused: Options of the study that cannot be used with recorded observations.
 
     Raises:
-        InputError: an argument is wrong, or cannot be combined with another one.
-        FileNotFoundError, CheckpointError: there is no checkpoint, or it does not fit.
-        GraphicsError: the simulator is needed and cannot draw here.
+        InputError: An argument is wrong, or cannot be combined with another one.
+        FileNotFoundError, CheckpointError: There is no checkpoint, or it does not fit.
+        GraphicsError: The simulator is needed and cannot draw here.
     """
     if "frames" in args:
         check_frames(args, "features", "config", "tasks", "episodes", *refused)
@@ -44,7 +44,7 @@ def source_of(args: argparse.Namespace, *refused: str) -> Source:
 
 
 def simulator_of(args: argparse.Namespace) -> Simulator:
-    """Creates a simulator from parsed arguments, for studies that need one; raises as `source_of`."""
+    """Creates a simulator from parsed arguments, for studies that need one; raises as ``source_of``."""
     if args.features is not None:
         raise InputError(
             "--features: this study needs the simulator; only cuts, patching, gradients, n-runtime and fast "
@@ -63,7 +63,7 @@ def simulator_of(args: argparse.Namespace) -> Simulator:
 
 
 def recording_of(args: argparse.Namespace, *refused: str) -> Recording:
-    """Creates a recording from parsed arguments, and reads it; arguments and errors as `source_of`."""
+    """Creates a recording from parsed arguments, and reads it; arguments and errors as ``source_of``."""
     given = [name for name in ("tasks", "episodes", *refused) if getattr(args, name) is not None]
     if given:
         flags = ", ".join("--" + name.replace("_", "-") for name in given)
@@ -84,7 +84,7 @@ def recording_of(args: argparse.Namespace, *refused: str) -> Recording:
 
 
 def pictures_of(args: argparse.Namespace) -> PictureSource:
-    """Creates a source of pictures from parsed arguments, and looks at them; errors as `source_of`."""
+    """Creates a source of pictures from parsed arguments, and looks at them; errors as ``source_of``."""
     found = PictureSource(
         checkpoint=str(resolve(checkpoint_of(args))),
         frames=path_text(args.frames),

@@ -25,12 +25,12 @@ class Arm:
 
     Attributes:
         name: Name in the table and on the command line.
-        label: Name in figures. Default: `name`.
+        label: Name in figures. Default: ``name``.
         about: Description for the report.
-        intervention: Function from the learned future tokens `(N, width)` and the random numbers of the
+        intervention: Function from the learned future tokens ``(N, width)`` and the random numbers of the
             episode to the intervention, or to None for no change.
         needs_future: Whether it requires future tokens.
-        settings: Further JSON values that its results depend on. Change them together with `intervention`,
+        settings: Further JSON values that its results depend on. Change them together with ``intervention``,
             so that cells measured earlier are measured again.
 
     Example:
@@ -95,7 +95,7 @@ class ArmStudy(Study):
         metrics: The measured columns of the table.
 
     Raises:
-        InputError: two arms or two metrics have the same name.
+        InputError: Two arms or two metrics have the same name.
     """
 
     source: Source
@@ -111,7 +111,7 @@ class ArmStudy(Study):
                 raise InputError(f"{what}: given {', '.join(names)}, expected distinct names")
 
     def settings(self) -> Mapping[str, Any]:
-        """See `Study`."""
+        """See ``Study``."""
         own = [metric.name for metric in self.metrics if metric not in METRICS]
         return {**self.source.describe(), **({"metrics": own} if own else {})}
 
@@ -156,7 +156,7 @@ def between_draws(chunks: Float32Array) -> float | None:
     """The mean |difference| of an action between two chunks of one observation from different noise.
 
     Args:
-        chunks: `(1, draws, horizon, action_dim)`.
+        chunks: ``(1, draws, horizon, action_dim)``.
     """
     drawn = chunks[0]
     if len(drawn) < 2:

@@ -57,7 +57,7 @@ def plain(value: Any) -> Any:
     """The value as JSON would return it: NumPy numbers become Python numbers, tuples lists, and NaN None.
 
     Raises:
-        TypeError: the value cannot be written as JSON.
+        TypeError: The value cannot be written as JSON.
 
     Example:
         >>> plain({"steps": np.int64(3), "rate": np.float32("nan"), "blocks": (0, 1)})

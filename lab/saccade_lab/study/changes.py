@@ -23,7 +23,7 @@ class ArmChange:
     Attributes:
         observations: Number of observations.
         change: Mean |change| of an action; None if it was not measured.
-        ratio: `change` divided by the change that another noise makes; None where noise was not drawn.
+        ratio: ``change`` divided by the change that another noise makes; None where noise was not drawn.
         largest: The largest change of one action.
         note: Why it was not measured.
     """
@@ -69,7 +69,7 @@ def change_section(
 
     Args:
         study: Its baseline is compared with the other arms, and its control must change nothing.
-        prose: Text of the study: `recorded_title`, `about` and `not_shown_of_arms`.
+        prose: Text of the study: ``recorded_title``, ``about`` and ``not_shown_of_arms``.
         labels: Labels of the arms, in their order. Arms that are not in the table are skipped.
         table, provenance: Table of the study and its provenance.
     """
@@ -105,7 +105,7 @@ def change_section(
 
 
 def recorded(table: pd.DataFrame, measured: pd.DataFrame, provenance: Provenance) -> dict[str, Any]:
-    """What the template `recording` says of a recording.
+    """What the template ``recording`` says of a recording.
 
     Args:
         table, provenance: Table of the study and its provenance.

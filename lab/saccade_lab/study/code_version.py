@@ -15,7 +15,7 @@ SECONDS = 10  # to wait for git
 def code_version() -> str:
     """The version of saccade; in a clone, followed by the commit, as a local version of PEP 440.
 
-    `0.1.0+g0123456789ab` was installed in place from that commit, and `0.1.0+g0123456789ab.changed` had
+    ``0.1.0+g0123456789ab`` was installed in place from that commit, and ``0.1.0+g0123456789ab.changed`` had
     changes of the package or the crates that were not committed. It is found at the first call: a commit that
     is made between the import and that call would be named instead.
     """

@@ -22,14 +22,14 @@ from saccade_lab.study.paths import ALL_PATHS, DETOUR, DIRECT, PATHS, READ
 
 LEAVING_FUTURE = (("state", "future"), ("action", "future"))
 READ_BY_OTHERS = (("state", "vl"), ("action", "vl"))
-#: Of the rows before the first block and after each, `(rows,)` both: the norm of the derivative by a row, and
-#: that times the length of the row.
+#: Of the rows before the first block and after each, both ``(rows,)``: the norm of the derivative by a row,
+#: and that times the length of the row.
 Sensitivity: TypeAlias = Sequence[tuple[Tensor, Tensor]]
 NO_MASKS: Mapping[str, Tensor] = MappingProxyType({})
 
 
 def conditions(count: int, embodiment_id: int, masks: Mapping[str, Tensor]) -> dict[str, Any]:
-    """Arguments of `ActionHead.sample` for `count` copies of one observation."""
+    """Arguments of ``ActionHead.sample`` for ``count`` copies of one observation."""
     return {"embodiment_id": embodiment_id, **{name: mask.expand(count, -1) for name, mask in masks.items()}}
 
 
@@ -45,16 +45,17 @@ def path_derivatives(
     """Derivatives of projections of the actions by the vision-language tokens, for each path.
 
     Args:
-        head: head that computes, in its dtype.
-        vl_embs: tokens of one observation, `(1, T_vl, context_dim)`.
-        state: `(1, state_dim)` or `(1, history, state_dim)`.
-        noise: `(1, T, action_dim)`.
-        cotangents: `(projections, T, action_dim)`; a projection is the sum of the product with the actions.
-        embodiment_id: embodiment of the robot.
-        masks: masks for `sample` by name: `drop_vl`, `attention_mask`, `image_mask`, `(1, T_vl)` bool.
+        head: Head that computes, in its dtype.
+        vl_embs: Tokens of one observation, ``(1, T_vl, context_dim)``.
+        state: ``(1, state_dim)`` or ``(1, history, state_dim)``.
+        noise: ``(1, T, action_dim)``.
+        cotangents: ``(projections, T, action_dim)``; a projection is the sum of the product with the actions.
+        embodiment_id: Embodiment of the robot.
+        masks: Masks for ``sample`` by name: ``drop_vl``, ``attention_mask``, ``image_mask``, ``(1, T_vl)``
+            bool.
 
     Returns:
-        Each path of `PATHS` and their sum `ALL_PATHS`, `(projections, T_vl, context_dim)`.
+        Each path of ``PATHS`` and their sum ``ALL_PATHS``, ``(projections, T_vl, context_dim)``.
     """
 
     def derivative(stopped: Sequence[tuple[str, str]]) -> Tensor:
@@ -77,11 +78,11 @@ def vl_derivative(
     """Derivatives of projections of the actions by the vision-language tokens.
 
     Args:
-        head, vl_embs, state, noise, cotangents, embodiment_id, masks: As in `path_derivatives`.
+        head, vl_embs, state, noise, cotangents, embodiment_id, masks: As in ``path_derivatives``.
         stopped: Pairs (reader, source) through which no derivative passes.
 
     Returns:
-        `(projections, T_vl, context_dim)`.
+        ``(projections, T_vl, context_dim)``.
     """
     count = len(cotangents)
     leaf = vl_embs.detach().repeat(count, 1, 1).requires_grad_()
@@ -112,7 +113,7 @@ class Shares:
 
 
 def shares(parts: Mapping[str, Tensor]) -> Shares:
-    """The shares of derivatives from `path_derivatives`.
+    """The shares of derivatives from ``path_derivatives``.
 
     With independent standard normal cotangents, the mean product of two projected derivatives is the
     Frobenius product of the two.
@@ -181,11 +182,11 @@ class Nudges:
                 handle.remove()
 
     def derivatives(self, scalar: Tensor) -> list[Tensor]:
-        """Derivatives of a scalar computed in `applied`, by place: `(batch, rows, width)`."""
+        """Derivatives of a scalar computed in ``applied``, by place: ``(batch, rows, width)``."""
         return list(torch.autograd.grad(scalar, self._zeros))
 
     def lengths(self) -> list[Tensor]:
-        """Lengths of the rows, by place: root mean square over batch and steps, `(rows,)`."""
+        """Lengths of the rows, by place: root mean square over batch and steps, ``(rows,)``."""
         return [(square.mean(dim=0) / self._steps).sqrt() for square in self._squares]
 
 
@@ -200,10 +201,10 @@ def action_sensitivity(
 ) -> Sensitivity:
     """How the sampled actions depend on the rows before the first block and after each.
 
-    Arguments as in `path_derivatives`.
+    Arguments as in ``path_derivatives``.
 
     Returns:
-        By place, `(rows,)` each: the Frobenius norm of the derivative by each row, and the same times the
+        By place, ``(rows,)`` each: the Frobenius norm of the derivative by each row, and the same times the
         length of the row, which is the change if the row changed by its own length. Every block normalises
         its inputs, so the norm alone depends on the length of a row as much as on its use.
     """
@@ -234,17 +235,17 @@ def loss_sensitivity(
     """How the flow-matching loss of one observation, averaged over times and noises, depends on the rows.
 
     Args:
-        head: head that computes, in its dtype.
-        features: backbone features, `(1, T_vl, context_dim)`.
-        state: `(1, state_dim)`.
-        actions: the demonstrated chunk, `(1, T, action_dim)`, normalised.
-        mask: weights of the actions, `(1, T, 1)`.
-        generator: generator of times and noise.
-        draws: number of times and noises.
-        embodiment_id: embodiment of the robot.
+        head: Head that computes, in its dtype.
+        features: Backbone features, ``(1, T_vl, context_dim)``.
+        state: ``(1, state_dim)``.
+        actions: The demonstrated chunk, ``(1, T, action_dim)``, normalised.
+        mask: Weights of the actions, ``(1, T, 1)``.
+        generator: Generator of times and noise.
+        draws: Number of times and noises.
+        embodiment_id: Embodiment of the robot.
 
     Returns:
-        As `action_sensitivity`, of the loss.
+        As ``action_sensitivity``, of the loss.
     """
     nudges = Nudges(head, draws)
     with nudges.applied():
@@ -262,7 +263,7 @@ def loss_sensitivity(
 
 
 def pooled(measured: Sequence[Sensitivity]) -> Sensitivity:
-    """`action_sensitivity` of several projections, from that of each."""
+    """``action_sensitivity`` of several projections, from that of each."""
 
     def pool(values: Sequence[Tensor]) -> Tensor:
         return torch.stack(list(values)).square().mean(dim=0).sqrt()

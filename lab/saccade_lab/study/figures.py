@@ -67,7 +67,7 @@ def lines(
 
     Args:
         x: Positions of the estimates; there is a tick at each.
-        series: An estimate for each `x`, by name of the series.
+        series: An estimate for each ``x``, by name of the series.
         x_label, y_label: Labels of the axes, with units.
         reference: Position of a dotted horizontal line.
     """

@@ -156,8 +156,8 @@ def part_rows(
         by_view: The norm of the derivative by the pixels of each token, ``(rows, columns)``, by view.
 
     Returns:
-        ``input`` is ``tokens`` or ``pixels``. ``share`` is that of the squares, of `relative` for tokens and
-        of `norm` for pixels: shares add up to 1.
+        ``input`` is ``tokens`` or ``pixels``. ``share`` is that of the squares, of ``relative`` for tokens
+        and of ``norm`` for pixels: shares add up to 1.
     """
     rows: list[dict[str, Any]] = []
     relative = found.tokens * found.lengths

@@ -39,10 +39,10 @@ class Frames:
     """Observations of several episodes; the first axis of every array is the observation.
 
     Attributes:
-        episodes: `(frames,)`, number of the episode.
-        tasks: `(frames,)`, number of the task.
-        inputs: What probes read, each `(frames, dimensions)`.
-        targets: What they predict, by name, each `(frames, coordinates)`.
+        episodes: ``(frames,)``, number of the episode.
+        tasks: ``(frames,)``, number of the task.
+        inputs: What probes read, each ``(frames, dimensions)``.
+        targets: What they predict, by name, each ``(frames, coordinates)``.
     """
 
     episodes: npt.NDArray[np.int64]
@@ -75,17 +75,17 @@ def held_out_errors(
 
     In each fold everything is fitted to the training episodes. The mean of the task is subtracted from inputs
     and targets, so that the difference between tasks does not count. Inputs are then standardised and reduced
-    to at most `dimensions` principal components. A ridge regression for each target follows; its penalty is
-    the best of `PENALTIES` in a cross-validation among the training episodes.
+    to at most ``dimensions`` principal components. A ridge regression for each target follows; its penalty is
+    the best of ``PENALTIES`` in a cross-validation among the training episodes.
 
     Args:
-        values: `(frames, inputs)`, what the probes read.
-        targets: each `(frames, coordinates)`.
-        frames: provides episodes and tasks.
-        dimensions: principal components that a probe reads at most.
+        values: ``(frames, inputs)``, what the probes read.
+        targets: Each ``(frames, coordinates)``.
+        frames: Provides episodes and tasks.
+        dimensions: Principal components that a probe reads at most.
 
     Returns:
-        For each target two arrays `(frames,)`: the squared error of the probe, and that of predicting the
+        For each target two arrays ``(frames,)``: the squared error of the probe, and that of predicting the
         mean of the training frames of the task. Both are summed over the coordinates.
     """
     found = {name: (np.zeros(len(values)), np.zeros(len(values))) for name in targets}
@@ -115,18 +115,18 @@ def best_penalties(
     owners: npt.NDArray[np.int64],
     episodes: npt.NDArray[np.int64],
 ) -> FloatArray:
-    """The penalty of `PENALTIES` with the least error in a cross-validation by episode, for each target.
+    """The penalty of ``PENALTIES`` with the least error in a cross-validation by episode, for each target.
 
     One decomposition serves all penalties and targets.
 
     Args:
-        values: `(frames, dimensions)`.
-        targets: `(frames, coordinates)` of all targets.
-        owners: `(coordinates,)`, the target of each.
-        episodes: `(frames,)`.
+        values: ``(frames, dimensions)``.
+        targets: ``(frames, coordinates)`` of all targets.
+        owners: ``(coordinates,)``, the target of each.
+        episodes: ``(frames,)``.
 
     Returns:
-        `(targets,)`.
+        ``(targets,)``.
     """
     errors = np.zeros((len(PENALTIES), targets.shape[1]))
     for train, test in GroupKFold(INNER_FOLDS).split(values, groups=episodes):
@@ -143,7 +143,7 @@ def best_penalties(
 
 
 def task_means(values: FloatArray, tasks: npt.NDArray[np.int64], chosen: npt.NDArray[np.int64]) -> FloatArray:
-    """For every frame the mean of its task over the chosen frames, shaped like `values`."""
+    """For every frame the mean of its task over the chosen frames, shaped like ``values``."""
     means = np.zeros_like(values)
     for task in np.unique(tasks):
         means[tasks == task] = values[chosen[tasks[chosen] == task]].mean(axis=0)
@@ -168,11 +168,11 @@ def explained(
     """R^2 of all episodes together, and of each bootstrap resample.
 
     Args:
-        errors, spreads: results of `held_out_errors`, summed by episode, `(episodes,)`.
-        draws: how often each resample contains each episode, `(resamples, episodes)`.
+        errors, spreads: Results of ``held_out_errors``, summed by episode, ``(episodes,)``.
+        draws: How often each resample contains each episode, ``(resamples, episodes)``.
 
     Returns:
-        1 - errors / spreads, and `(resamples,)` of the same.
+        1 - errors / spreads, and ``(resamples,)`` of the same.
     """
     return float(1 - errors.sum() / spreads.sum()), 1 - (draws @ errors) / (draws @ spreads)
 
@@ -189,8 +189,8 @@ def probe(frames: Frames, dimensions: int) -> list[dict[str, Any]]:
     All probes use the same bootstrap resamples, so differences are paired.
 
     Args:
-        frames: frames of the scope. Other inputs are compared with the inputs `PROPRIO` and `VL`.
-        dimensions: see `held_out_errors`.
+        frames: Frames of the scope. Other inputs are compared with the inputs ``PROPRIO`` and ``VL``.
+        dimensions: See ``held_out_errors``.
 
     Returns:
         A row per target and input, for targets that vary.
@@ -253,7 +253,7 @@ def save_frames(frames: Frames, path: Path) -> None:
 
 
 def load_frames(path: Path) -> Frames:
-    """Reads what `save_frames` wrote."""
+    """Reads what ``save_frames`` wrote."""
     inputs: dict[Input, FloatArray] = {}
     targets: dict[str, FloatArray] = {}
     with np.load(path, allow_pickle=False) as arrays:

@@ -21,9 +21,9 @@ class SavedPicture:
     """A picture that is on disk.
 
     Attributes:
-        caption: As in `section.Figure`.
+        caption: As in ``section.Figure``.
         file: Its path relative to the report, for the Markdown.
-        data: The whole picture as a `data:` URI, for the HTML.
+        data: The whole picture as a ``data:`` URI, for the HTML.
     """
 
     caption: str
@@ -49,7 +49,7 @@ class Part:
 
 
 def to_markdown(title: str, opening: Sequence[str], parts: Sequence[Part]) -> str:
-    """The whole report; `opening` has its first paragraphs."""
+    """The whole report; ``opening`` has its first paragraphs."""
     text = (
         templates()
         .get_template("report.md.jinja")
@@ -62,8 +62,8 @@ def to_html(markdown: str, pictures: Mapping[str, str]) -> str:
     """The same report as one page.
 
     Args:
-        markdown: The result of `to_markdown`. HTML in it is shown as text.
-        pictures: The `data:` URI of each file that the Markdown refers to.
+        markdown: The result of ``to_markdown``. HTML in it is shown as text.
+        pictures: The ``data:`` URI of each file that the Markdown refers to.
     """
     parser = MarkdownIt("commonmark", {"html": False}).enable("table")
     parser.add_render_rule("table_open", open_table)
@@ -89,7 +89,7 @@ def open_table(self: Any, tokens: Sequence[Token], index: int, options: Any, env
 
 
 def close_table(self: Any, tokens: Sequence[Token], index: int, options: Any, env: Any) -> str:
-    """Ends what `open_table` began."""
+    """Ends what ``open_table`` began."""
     return "</table></div>\n"
 
 

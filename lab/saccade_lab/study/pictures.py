@@ -39,12 +39,12 @@ class PictureSource(Recorded):
     it is loaded alone, in float32: what computes gradients in torch has the memory for itself.
 
     Attributes:
-        checkpoint: A checkpoint that `saccade.Policy.from_pretrained` reads.
-        frames: Directory of the pictures, see `saccade.observations.pictures.read_frames`.
-        instruction, state: As `read_frames` takes them.
+        checkpoint: A checkpoint that ``saccade.Policy.from_pretrained`` reads.
+        frames: Directory of the pictures, see ``saccade.observations.pictures.read_frames``.
+        instruction, state: As ``read_frames`` takes them.
         other_frames, other_instruction: Of the observations to compare with. Where one is None, it is that of
             the others; with both None nothing is compared.
-        embodiment, preprocessing, tokenizer: As `saccade.Policy.from_pretrained` takes them.
+        embodiment, preprocessing, tokenizer: As ``saccade.Policy.from_pretrained`` takes them.
         precision: How the backbone computes.
         seed: Seed of random tokens and of the noise.
         num_threads: Number of threads. Default: that of the engine.
@@ -68,12 +68,12 @@ class PictureSource(Recorded):
 
     @property
     def files(self) -> tuple[str, ...]:
-        """See `Source`."""
+        """See ``Source``."""
         read = (self.frames, self.other_frames, self.state, self.tokenizer)
         return (*super().files, *(path for path in read if path is not None and Path(path).exists()))
 
     def describe(self) -> dict[str, Any]:
-        """See `Source`."""
+        """See ``Source``."""
         encoded = encode(self)
         other = described(self.other_frames or self.frames, encoded.others) if encoded.others else None
         return {
@@ -92,7 +92,7 @@ class PictureSource(Recorded):
         }
 
     def head(self, precision: str = "float32") -> ActionHead:
-        """See `Source`."""
+        """See ``Source``."""
         if precision != "float32":
             raise InputError(f"precision: expected float32 for a head on pictures, got {precision}")
         (embodiment_id,) = set(self.all.embodiment_id.tolist())
@@ -100,7 +100,7 @@ class PictureSource(Recorded):
 
     @property
     def config(self) -> HeadConfig:
-        """See `Source`."""
+        """See ``Source``."""
         return encode(self).config
 
     @property
@@ -110,7 +110,7 @@ class PictureSource(Recorded):
 
     @property
     def all(self) -> HeadInputs:
-        """See `Recorded`; raises as `read_frames` and `saccade.Policy.from_pretrained`."""
+        """See ``Recorded``; raises as ``read_frames`` and ``saccade.Policy.from_pretrained``."""
         return encode(self).observation
 
     @property
@@ -119,7 +119,7 @@ class PictureSource(Recorded):
         return encode(self).other_observation
 
     def labels(self, task: str, seed: int) -> dict[str, Any]:
-        """See `Source`; with the name of the picture."""
+        """See ``Source``; with the name of the picture."""
         return {**super().labels(task, seed), "moment": encode(self).pictures[seed].name}
 
 
@@ -134,8 +134,8 @@ class Encoded:
         action_width: Number of the head's action dimensions that the robot uses.
         pictures, others: The observations, and those to compare them with.
         observation, other_observation: The same as the head takes them; None without others.
-        inputs: What the backbone was given for each of `pictures`.
-        layouts: What is at each position of each of `pictures`.
+        inputs: What the backbone was given for each of ``pictures``.
+        layouts: What is at each position of each of ``pictures``.
         backbone_config: Config of the backbone.
     """
 

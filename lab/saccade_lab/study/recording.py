@@ -41,7 +41,7 @@ class Recorded(Source):
 
     @property
     def others(self) -> HeadInputs | None:
-        """For each of `all` an observation to compare it with, or None if there are none."""
+        """For each of ``all`` an observation to compare it with, or None if there are none."""
         return None
 
     @property
@@ -51,11 +51,11 @@ class Recorded(Source):
 
     @property
     def config(self) -> HeadConfig:
-        """See `Source`."""
+        """See ``Source``."""
         return self.head().config
 
     def observed(self, task: str, seed: int) -> HeadInputs:
-        """See `Source`."""
+        """See ``Source``."""
         rng = np.random.default_rng([self.seed, seed])
         return self.all.row(seed).with_noise(rng, self.config, NOISES)
 
@@ -64,35 +64,35 @@ class Recorded(Source):
         return int(self.all.clusters[row])
 
     def rng(self, task: str, seed: int) -> np.random.Generator:
-        """See `Source`; the same for all observations of an episode."""
+        """See ``Source``; the same for all observations of an episode."""
         return episode_rng(f"{task} {self.seed}", self.episode_of(seed))
 
     def encode(self, observation: HeadInputs) -> Any:
-        """See `Source`."""
+        """See ``Source``."""
         return observation.encode(self.head())
 
     def actions(
         self, observation: HeadInputs, intervention: Intervention | None, context: Any = None
     ) -> Float32Array:
-        """The head's own, normalised actions, those that count; see `Source`."""
+        """The head's own, normalised actions, those that count; see ``Source``."""
         found = observation.sample(self.head(), context, intervention=intervention)
         found = found[..., : self.action_width]
         return found if found.ndim == 4 else found[:, None]
 
     def comparable(self, chunk: Float32Array) -> Float32Array:
-        """See `Source`."""
+        """See ``Source``."""
         return chunk
 
     def outcome(self, task: str, seed: int, intervention: Intervention | None) -> dict[str, Any]:
-        """See `Source`."""
+        """See ``Source``."""
         return {"success": None}
 
     def labels(self, task: str, seed: int) -> dict[str, Any]:
-        """See `Source`."""
+        """See ``Source``."""
         return {"episode": self.episode_of(seed)}
 
     def describe_head(self, checkpoint: dict[str, str]) -> dict[str, Any]:
-        """What `describe` says of the checkpoint.
+        """What ``describe`` says of the checkpoint.
 
         Args:
             checkpoint: Its name and hash.
@@ -116,8 +116,8 @@ class Recording(Recorded):
     """A checkpoint and a file of features for it.
 
     Attributes:
-        checkpoint: A checkpoint that `ActionHead.from_pretrained` reads.
-        file: File of features, see `saccade.head.input_files.read_arrays`.
+        checkpoint: A checkpoint that ``ActionHead.from_pretrained`` reads.
+        file: File of features, see ``saccade.head.input_files.read_arrays``.
         config_file: Path of the head's config. Default: that of the checkpoint.
         seed: Seed of random tokens, and of the noise if the file contains none.
         num_threads: Number of threads of the head. Default: that of the engine.
@@ -132,11 +132,11 @@ class Recording(Recorded):
 
     @property
     def files(self) -> tuple[str, ...]:
-        """See `Source`."""
+        """See ``Source``."""
         return (*super().files, self.file)
 
     def describe(self) -> dict[str, Any]:
-        """See `Source`."""
+        """See ``Source``."""
         found = self.all
         checkpoint = checkpoint_identity(Path(self.checkpoint))
         if self.config_file is not None:
@@ -154,12 +154,12 @@ class Recording(Recorded):
         }
 
     def head(self, precision: str = "float32") -> ActionHead:
-        """See `Source`."""
+        """See ``Source``."""
         return head_of(self.checkpoint, self.config_file, precision, self.num_threads)
 
     @property
     def all(self) -> HeadInputs:
-        """All observations of the file, checked; raises as `saccade.head.inputs.HeadInputs.from_file`."""
+        """All observations of the file, checked; raises as ``saccade.head.inputs.HeadInputs.from_file``."""
         return read(self.file, self.config)
 
 

@@ -22,10 +22,10 @@ PNG_DOTS_PER_INCH = 130
 
 
 def write_report(directory: Path) -> tuple[Path, Path]:
-    """Writes `report.html`, which contains everything it shows, and `report.md` with `figures/*.png`.
+    """Writes ``report.html``, which contains everything it shows, and ``report.md`` with ``figures/*.png``.
 
     Args:
-        directory: What the studies had as `--out`.
+        directory: What the studies had as ``--out``.
 
     Returns:
         The paths of the HTML and of the Markdown.
@@ -85,7 +85,7 @@ def make_part(directory: Path, name: str) -> Part:
 
 
 def attention_part(directory: Path) -> Part:
-    """What `saccade attention` wrote into the directory: its sheets, and links to its pages."""
+    """What ``saccade attention`` wrote into the directory: its sheets, and links to its pages."""
     sheets, pages = (sorted((directory / ATTENTION).rglob(pattern)) for pattern in ("*.png", "*.html"))
     prose = Prose("attention", pages=[page.relative_to(directory).as_posix() for page in pages])
     pictures = []
@@ -110,5 +110,5 @@ def draw(directory: Path, name: str, figure: Figure) -> SavedPicture:
 
 
 def as_uri(kind: str, content: bytes) -> str:
-    """A file's content as a `data:` URI."""
+    """A file's content as a ``data:`` URI."""
     return f"data:{kind};base64,{base64.b64encode(content).decode('ascii')}"

@@ -55,21 +55,21 @@ OnDone: TypeAlias = Callable[[Finished, int, int], None]
 
 
 def silent(finished: Finished, done: int, total: int) -> None:
-    """An `OnDone` that does nothing."""
+    """An ``OnDone`` that does nothing."""
 
 
 def run(study: Study, out: Path, *, workers: Workers = ALONE, on_done: OnDone = silent) -> pd.DataFrame:
     """Computes all stages of a study, and its table.
 
     Args:
-        study: what is measured.
-        out, workers, on_done: as in `run_cells`.
+        study: What is measured.
+        out, workers, on_done: As in ``run_cells``.
 
     Returns:
         The table.
 
     Raises:
-        InputError, StudyError: as `run_cells`.
+        InputError, StudyError: As ``run_cells``.
     """
     stage: Study | None = study.begin(out.absolute())  # other processes may be in another directory
     while stage is not None:
@@ -102,30 +102,30 @@ def run_cells(
 ) -> pd.DataFrame:
     """Computes the cells that are not done yet. A run that was killed continues where it stopped.
 
-    A finished cell is a file in `OUT/<study>/cells`. After each cell `OUT/<study>.csv` (rows of all finished
-    cells, sorted by key, with the columns that `work` returned and `settings_sha256`, `saccade` and `cpu`)
-    and `OUT/<study>.json` are rewritten. Cells of an earlier run with the same settings stay in the table, so
-    a study can be extended by running it again with more cells.
+    A finished cell is a file in ``OUT/<study>/cells``. After each cell ``OUT/<study>.csv`` (rows of all
+    finished cells, sorted by key, with the columns that ``work`` returned and ``settings_sha256``,
+    ``saccade`` and ``cpu``) and ``OUT/<study>.json`` are rewritten. Cells of an earlier run with the same
+    settings stay in the table, so a study can be extended by running it again with more cells.
 
     Args:
-        study: name of the table.
-        cells: all of them, done or not, with distinct keys.
-        work: function from a cell to its rows; values are text, numbers, booleans or None. It runs in other
+        study: Name of the table.
+        cells: All of them, done or not, with distinct keys.
+        work: Function from a cell to its rows; values are text, numbers, booleans or None. It runs in other
             processes, so it must be picklable.
-        out: directory of the tables.
+        out: Directory of the tables.
         settings: JSON values that all rows depend on: hashes of checkpoints, engine, and so on; not what
             only determines which cells there are.
-        workers: the processes that cells run in. A cell whose process or machine died is computed again.
-        files: files and directories that `work` reads, as `saccade_lab.parallel.each` takes them.
-        on_done: called after each cell.
-        expected: number of cells of all stages; the table is complete when that many are done.
+        workers: The processes that cells run in. A cell whose process or machine died is computed again.
+        files: Files and directories that ``work`` reads, as ``saccade_lab.parallel.each`` takes them.
+        on_done: Called after each cell.
+        expected: Number of cells of all stages; the table is complete when that many are done.
 
     Returns:
-        The table, as `saccade_lab.study.table.read_table` returns it.
+        The table, as ``saccade_lab.study.table.read_table`` returns it.
 
     Raises:
-        InputError: keys that are not distinct, or `out` contains this study with other settings.
-        StudyError: cells failed, and the first ones are named with their errors. Finished cells remain
+        InputError: Keys that are not distinct, or ``out`` contains this study with other settings.
+        StudyError: Cells failed, and the first ones are named with their errors. Finished cells remain
             stored.
     """
     if len({cell.key for cell in cells}) != len(cells):
@@ -151,10 +151,10 @@ class Store:
     """The files of one study.
 
     Args:
-        study, out, settings, cells, expected: as in `run_cells`.
+        study, out, settings, cells, expected: As in ``run_cells``.
 
     Raises:
-        InputError: `out` contains this study with other settings.
+        InputError: ``out`` contains this study with other settings.
     """
 
     def __init__(
@@ -253,7 +253,7 @@ def read_record(path: Path) -> dict[str, Any] | None:
 
 @dataclass(frozen=True)
 class Guarded:
-    """`work` that returns exceptions instead of raising them, and adds `marks` to every row."""
+    """``work`` that returns exceptions instead of raising them, and adds ``marks`` to every row."""
 
     work: Callable[[Cell], Rows]
     marks: Mapping[str, str]

@@ -1,4 +1,4 @@
-"""Runs of `saccade train` in a study: planned, trained and read."""
+"""Runs of ``saccade train`` in a study: planned, trained and read."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class Planned:
 
     Attributes:
         name: Name of its directory.
-        demonstrations: Directory of `saccade demos`.
+        demonstrations: Directory of ``saccade demos``.
         training: Its settings.
     """
 
@@ -32,7 +32,7 @@ class Planned:
     training: TrainingSettings
 
     def settings(self) -> dict[str, Any]:
-        """What `settings.json` of the run will contain."""
+        """What ``settings.json`` of the run will contain."""
         from saccade_lab.sim import demos
         from saccade_lab.training.dataset import describe
 
@@ -43,7 +43,7 @@ class Planned:
         }
 
     def train(self, out: Path, start: Path | None = None) -> None:
-        """Trains the run on one thread, or continues the one in `out`.
+        """Trains the run on one thread, or continues the one in ``out``.
 
         Args:
             out: The run's directory.
@@ -64,8 +64,8 @@ class Run:
     Attributes:
         name: Name of its directory.
         directory: The run's directory.
-        settings: Contents of `settings.json`.
-        history: Contents of `history.json`.
+        settings: Contents of ``settings.json``.
+        history: Contents of ``history.json``.
         point: Names and values of what the sweep varies.
     """
 
@@ -87,7 +87,7 @@ class Run:
 
     @property
     def checkpoint_sha256(self) -> str:
-        """Hash of the policy's files, equal to `Policy.checkpoint_sha256`."""
+        """Hash of the policy's files, equal to ``Policy.checkpoint_sha256``."""
         return checkpoint_identity(self.directory)["sha256"]
 
     @property
@@ -97,11 +97,11 @@ class Run:
 
 
 def read_run(directory: Path, varied: Sequence[str]) -> Run:
-    """A run of `saccade train`.
+    """A run of ``saccade train``.
 
     Raises:
         FileNotFoundError: There is none.
-        InputError: Its files are not what `saccade train` writes.
+        InputError: Its files are not what ``saccade train`` writes.
     """
     from saccade.processor import Processor
     from saccade_lab.sim.policy import num_vl_tokens
@@ -128,7 +128,7 @@ def read_run(directory: Path, varied: Sequence[str]) -> Run:
 
 
 def saved_step(state: Path) -> int:
-    """The step at which a run can be continued from its `training.pt`; 0 if there is none."""
+    """The step at which a run can be continued from its ``training.pt``; 0 if there is none."""
     if not state.is_file():
         return 0
     import torch

@@ -105,7 +105,7 @@ def points(difference: Estimate) -> str:
 
 @functools.cache
 def templates(package: str = PACKAGE) -> Environment:
-    """The templates of a package's folder `pages`, with the filters that write numbers."""
+    """The templates of a package's folder ``pages``, with the filters that write numbers."""
     environment = Environment(
         loader=PackageLoader(package, "pages"),
         autoescape=lambda name: bool(name and name.endswith(".html.jinja")),
@@ -125,10 +125,10 @@ def templates(package: str = PACKAGE) -> Environment:
 
 
 class Prose:
-    """The text of a section: the macros of `pages/NAME.md.jinja`, with the values that they print.
+    """The text of a section: the macros of ``pages/NAME.md.jinja``, with the values that they print.
 
-    A macro's text may be wrapped over lines: `paragraphs` are separated by blank lines, and each of the
-    `points` begins with a hyphen.
+    A macro's text may be wrapped over lines: ``paragraphs`` are separated by blank lines, and each of the
+    ``points`` begins with a hyphen.
 
     Args:
         name: Name of the template.
@@ -157,7 +157,7 @@ class Prose:
         return [" ".join(one.split()) for one in found if one.strip()]
 
     def section(self, figures: Sequence[Figure] = (), grids: Sequence[Grid] = ()) -> Section:
-        """The section that the macros `title`, `summary`, `concluded` and `not_shown` describe."""
+        """The section that the macros ``title``, ``summary``, ``concluded`` and ``not_shown`` describe."""
         return Section(
             title=self.line("title"),
             summary=self.paragraphs("summary"),

@@ -1,8 +1,8 @@
 """The exact sign-flip test of paired differences, with the interval that it implies.
 
 If the two sides of every pair are exchangeable, each difference is as likely as its negative. The test
-compares the observed sum with the sums under all `2^n` patterns of signs, so it needs no distribution and no
-variance.
+compares the observed sum with the sums under all ``2^n`` patterns of signs, so it needs no distribution and
+no variance.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ class SignFlip:
     """Paired differences, and the test that they are symmetric around zero.
 
     Attributes:
-        difference: Their mean, with the 95 % interval of `sign_flip`.
-        p_value: Two-sided, `k / 2^n` with an even `k` of at least 2.
+        difference: Their mean, with the 95 % interval of ``sign_flip``.
+        p_value: Two-sided, ``k / 2^n`` with an even ``k`` of at least 2.
         pairs: Their number.
     """
 
@@ -40,7 +40,7 @@ class SignFlip:
 def sign_flip(differences: npt.ArrayLike) -> SignFlip:
     """Tests whether paired differences are symmetric around zero, exactly.
 
-    The p value is the share of all `2^n` patterns of signs whose sum is at least as far from zero as the
+    The p value is the share of all ``2^n`` patterns of signs whose sum is at least as far from zero as the
     observed one. The interval contains every shift that the same test does not reject at the 5 % level when
     it is subtracted from all differences. Both count the same subsets: a pattern that flips the signs of a
     subset is as extreme as the data exactly if the shift lies between the mean of the subset and that of the
@@ -50,10 +50,10 @@ def sign_flip(differences: npt.ArrayLike) -> SignFlip:
     every shift is possible, and the bounds are NaN.
 
     Args:
-        differences: `(n,)`, one for each pair.
+        differences: ``(n,)``, one for each pair.
 
     Raises:
-        InputError: there are none, more than `MOST_PAIRS`, or they are not finite.
+        InputError: There are none, more than ``MOST_PAIRS``, or they are not finite.
 
     Example:
         Two treatments of 10 patients, the extra hours of sleep (Student, Biometrika 6, 1908):
@@ -73,16 +73,16 @@ def sign_flip(differences: npt.ArrayLike) -> SignFlip:
 
 
 def sign_flip_p(differences: npt.ArrayLike) -> npt.NDArray[np.float64]:
-    """The p values of `sign_flip` for many sets of differences at once.
+    """The p values of ``sign_flip`` for many sets of differences at once.
 
     Args:
-        differences: `(..., n)`.
+        differences: ``(..., n)``.
 
     Returns:
-        `(...)`.
+        ``(...)``.
 
     Raises:
-        InputError: as `sign_flip`.
+        InputError: As ``sign_flip``.
 
     Example:
         >>> sign_flip_p([[1.0, 2.0, 3.0], [1.0, -2.0, 3.0]]).tolist()
@@ -103,10 +103,10 @@ def sign_flip_p(differences: npt.ArrayLike) -> npt.NDArray[np.float64]:
 
 
 def interval(values: npt.NDArray[np.float64]) -> tuple[float, float]:
-    """The bounds of the interval of `sign_flip`, NaN where it is unbounded.
+    """The bounds of the interval of ``sign_flip``, NaN where it is unbounded.
 
     Args:
-        values: The differences, `(n,)`.
+        values: The differences, ``(n,)``.
     """
     # Of each pair of complementary subsets one contains the first difference.
     sums, counts = values[:1], np.ones(1)
@@ -126,7 +126,7 @@ def interval(values: npt.NDArray[np.float64]) -> tuple[float, float]:
 
 
 def checked(differences: npt.ArrayLike | Sequence[float]) -> npt.NDArray[np.float64]:
-    """The differences as an array `(..., n)`; raises as `sign_flip`."""
+    """The differences as an array ``(..., n)``; raises as ``sign_flip``."""
     values = np.asarray(differences, dtype=np.float64)
     if values.ndim == 0 or not 1 <= values.shape[-1] <= MOST_PAIRS:
         raise InputError(f"differences: shape {values.shape}, expected 1 to {MOST_PAIRS} pairs")

@@ -36,7 +36,7 @@ class Simulator(Source):
         checkpoint: Directory of the policy.
         tasks: Names of tasks.
         seeds: One episode of each task for each seed.
-        engine: What computes the head in closed loop, `"rust"` or `"torch"`.
+        engine: What computes the head in closed loop, ``"rust"`` or ``"torch"``.
     """
 
     checkpoint: str
@@ -46,7 +46,7 @@ class Simulator(Source):
     closed_loop: ClassVar[bool] = True
 
     def describe(self) -> dict[str, Any]:
-        """See `Source`."""
+        """See ``Source``."""
         policy = policy_of(self.checkpoint)
         return {
             "checkpoint": {
@@ -66,12 +66,12 @@ class Simulator(Source):
 
     @property
     def config(self) -> HeadConfig:
-        """See `Source`."""
+        """See ``Source``."""
         return self.policy.head.config
 
     @property
     def engine_name(self) -> str:
-        """See `Source`."""
+        """See ``Source``."""
         return self.engine
 
     @property
@@ -80,7 +80,7 @@ class Simulator(Source):
         return policy_of(self.checkpoint, self.engine)
 
     def head(self, precision: str = "float32") -> ActionHead:
-        """See `Source`. Computes on one thread, because cells are spread over processes."""
+        """See ``Source``. Computes on one thread, because cells are spread over processes."""
         return head_of(self.checkpoint, precision)
 
     def recorded(self, task: str, seed: int) -> Recorded:
@@ -88,11 +88,11 @@ class Simulator(Source):
         return recorded(self.checkpoint, self.engine, task, seed)
 
     def observed(self, task: str, seed: int) -> HeadInputs:
-        """See `Source`."""
+        """See ``Source``."""
         return self.recorded(task, seed).observation
 
     def rng(self, task: str, seed: int) -> np.random.Generator:
-        """See `Source`."""
+        """See ``Source``."""
         return episode_rng(task, seed)
 
     def first(self, task: str, seed: int, instruction: str) -> HeadInputs:
@@ -105,13 +105,13 @@ class Simulator(Source):
         return HeadInputs(self.policy.features(seen), self.policy.state(seen), ids)
 
     def encode(self, observation: HeadInputs) -> Any:
-        """See `Source`."""
+        """See ``Source``."""
         return self.policy.head.encode(observation.backbone_features)
 
     def actions(
         self, observation: HeadInputs, intervention: Intervention | None, context: Any = None
     ) -> Float32Array:
-        """Actions of the robot, in [-1, 1]; see `Source`."""
+        """Actions of the robot, in [-1, 1]; see ``Source``."""
         assert observation.noise is not None
         found = self.policy.head.sample(
             self.encode(observation) if context is None else context,
@@ -123,11 +123,11 @@ class Simulator(Source):
         return self.comparable(np.asarray(found))[:, None]
 
     def comparable(self, chunk: Float32Array) -> Float32Array:
-        """See `Source`."""
+        """See ``Source``."""
         return self.policy.robot_actions(chunk)
 
     def outcome(self, task: str, seed: int, intervention: Intervention | None) -> dict[str, Any]:
-        """See `Source`."""
+        """See ``Source``."""
         unchanged = self.recorded(task, seed)
         episode = unchanged.episode
         if intervention is not None:
@@ -140,7 +140,7 @@ class Simulator(Source):
         }
 
     def labels(self, task: str, seed: int) -> dict[str, Any]:
-        """See `Source`."""
+        """See ``Source``."""
         return {}
 
 
@@ -150,13 +150,13 @@ def simulator(
     """Episodes of a policy.
 
     Args:
-        checkpoint: directory of the policy. Default: the bundled policy.
-        tasks: names of tasks. Default: all that the policy was trained on.
-        seeds: seeds of the episodes of each task.
-        engine: what computes the head.
+        checkpoint: Directory of the policy. Default: the bundled policy.
+        tasks: Names of tasks. Default: all that the policy was trained on.
+        seeds: Seeds of the episodes of each task.
+        engine: What computes the head.
 
     Raises:
-        FileNotFoundError, CheckpointError: there is no policy, or it was not trained on a task.
+        FileNotFoundError, CheckpointError: There is no policy, or it was not trained on a task.
     """
     path = path_text(checkpoint or DEMO_CHECKPOINT)
     try:
@@ -175,10 +175,10 @@ class PrivilegedState:
     """What the simulator knows and the policy does not, at every observation of an episode.
 
     Attributes:
-        object, goal: Positions `(observations, 3)` in metres. In tasks with balls, the first and the last
+        object, goal: Positions ``(observations, 3)`` in metres. In tasks with balls, the first and the last
             ball.
-        hand: Position of the hand `(observations, 3)` in metres.
-        gripper: Opening of the gripper `(observations, 1)`, 0 to 1.
+        hand: Position of the hand ``(observations, 3)`` in metres.
+        gripper: Opening of the gripper ``(observations, 1)``, 0 to 1.
     """
 
     object: Float32Array
@@ -203,11 +203,11 @@ class Recorded:
 
 
 class Recorder(WrappedHead):
-    """A head that records its inputs and passes them on; a `saccade.policy.interfaces.Head`.
+    """A head that records its inputs and passes them on; a ``saccade.policy.interfaces.Head``.
 
     Args:
-        head: head that computes.
-        environment: environment whose positions are recorded at every observation.
+        head: Head that computes.
+        environment: Environment whose positions are recorded at every observation.
     """
 
     def __init__(self, head: Head, environment: TaskEnvironment) -> None:
@@ -217,12 +217,12 @@ class Recorder(WrappedHead):
         self._encoded: tuple[Float32Array, BoolArray] | None = None
 
     def encode(self, backbone_features: ArrayLike, **masks: Any) -> Any:
-        """See `Head`."""
+        """See ``Head``."""
         self._encoded = np.array(backbone_features), np.array(masks["image_mask"])
         return self._wrapped.encode(backbone_features, **masks)
 
     def sample(self, context: Any, state: ArrayLike, embodiment_id: Any, **options: Any) -> Any:
-        """See `Head`."""
+        """See ``Head``."""
         targets = self._environment.privileged_targets()
         proprio = self._environment.last_observation["proprio"]
         known = (targets[None, :3], targets[None, 3:6], proprio[None, :3], proprio[None, 3:4])

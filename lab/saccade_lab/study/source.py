@@ -21,7 +21,7 @@ class Source(ABC):
     """Observations for a checkpoint.
 
     A source is a frozen dataclass: it is pickled, and results are cached by its value. A unit is an episode,
-    identified by task and seed, or a row of a file, identified by `recording.TASK` and its number.
+    identified by task and seed, or a row of a file, identified by ``recording.TASK`` and its number.
 
     Attributes:
         closed_loop: Whether episodes can be run, so that success is known.
@@ -76,7 +76,7 @@ class Source(ABC):
 
     @property
     def future_tokens(self) -> Float32Array:
-        """The learned future tokens, `(N, width)`; N is 0 where the checkpoint has none."""
+        """The learned future tokens, ``(N, width)``; N is 0 where the checkpoint has none."""
         return self.head().future_tokens
 
     @abstractmethod
@@ -95,17 +95,17 @@ class Source(ABC):
     def actions(
         self, observation: HeadInputs, intervention: Intervention | None, context: Any = None
     ) -> Float32Array:
-        """Chunks as they are compared, `(batch, draws, horizon, action_dim)`.
+        """Chunks as they are compared, ``(batch, draws, horizon, action_dim)``.
 
         Args:
-            observation: one row, with noise.
-            intervention: the change inside the head; None for no change.
-            context: the result of `encode`. Default: it is computed.
+            observation: One row, with noise.
+            intervention: The change inside the head; None for no change.
+            context: The result of ``encode``. Default: it is computed.
         """
 
     @abstractmethod
     def encode(self, observation: HeadInputs) -> Any:
-        """The `context` of an observation for `actions`."""
+        """The ``context`` of an observation for ``actions``."""
 
     @abstractmethod
     def comparable(self, chunk: Float32Array) -> Float32Array:
@@ -134,7 +134,7 @@ class Unchanged:
     Attributes:
         observations: One row each.
         contexts: The context of each observation.
-        actions: `(observations, draws, horizon, action_dim)`, as they are compared.
+        actions: ``(observations, draws, horizon, action_dim)``, as they are compared.
     """
 
     observations: Sequence[HeadInputs]
@@ -152,7 +152,7 @@ def unchanged(source: Source, task: str, seed: int) -> Unchanged:
 
 
 def changed(source: Source, task: str, seed: int, intervention: Intervention | None) -> Float32Array:
-    """The actions of `unchanged` with an intervention, from equal noise."""
+    """The actions of ``unchanged`` with an intervention, from equal noise."""
     before = unchanged(source, task, seed)
     if intervention is None:
         return before.actions

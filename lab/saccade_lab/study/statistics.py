@@ -36,10 +36,10 @@ def verdict(difference: Estimate) -> Verdict:
 
     The first of these rules that holds decides:
 
-    1. `better`: the whole interval is above zero.
-    2. `worse`: the whole interval is below zero, even if it excludes a loss of `LOSS_THAT_MATTERS`.
-    3. `no worse`: the interval contains zero and excludes a loss of `LOSS_THAT_MATTERS`.
-    4. `undecided`: anything else, and a difference without an interval.
+    1. ``better``: the whole interval is above zero.
+    2. ``worse``: the whole interval is below zero, even if it excludes a loss of ``LOSS_THAT_MATTERS``.
+    3. ``no worse``: the interval contains zero and excludes a loss of ``LOSS_THAT_MATTERS``.
+    4. ``undecided``: anything else, and a difference without an interval.
 
     Example:
         >>> [verdict(Estimate((low + high) / 2, low, high))
@@ -63,8 +63,8 @@ class PairedDifference:
         difference: Success rate of the first arm minus that of the second, with Tango's score interval.
         pairs: Number of episodes that both arms ran.
         both, only_first, only_second, neither: Number of episodes in which both arms succeeded, only one of
-            them, or none. Only the discordant pairs (`only_first`, `only_second`) distinguish the arms.
-        p_value: p value of McNemar's exact test.
+            them, or none. Only the discordant pairs (``only_first``, ``only_second``) distinguish the arms.
+        p_value: P value of McNemar's exact test.
     """
 
     difference: Estimate
@@ -85,7 +85,7 @@ def wilson(successes: int, trials: int) -> Estimate:
     """A success rate with Wilson's score interval; without trials, NaN with the interval 0 to 1.
 
     Raises:
-        InputError: `successes` is negative or larger than `trials`.
+        InputError: ``successes`` is negative or larger than ``trials``.
 
     Example:
         >>> rate = wilson(18, 20)
@@ -176,9 +176,9 @@ def tango_score(only_first: float, only_second: float, pairs: int, difference: f
 
 
 def p_of_loss(pairs: PairedDifference, loss: float) -> float:
-    """One-sided p value of the hypothesis that the first arm is worse by at least `loss`, by Tango's score.
+    """One-sided p value of the hypothesis that the first arm is worse by at least ``loss``, by Tango's score.
 
-    It is below 2.5 % exactly where the 95 % interval excludes such a loss. Correct it with `holm` when
+    It is below 2.5 % exactly where the 95 % interval excludes such a loss. Correct it with ``holm`` when
     several arms are compared with the same second arm.
 
     Example:
@@ -217,20 +217,20 @@ def bootstrap(
 
     Whole clusters are drawn with replacement, because observations of one episode are correlated. With fewer
     than about ten clusters the interval is too narrow; with one cluster its bounds are NaN. Where all values
-    are equal the interval has zero width, which does not prove equality: use `wilson` for rates and
-    `paired_difference` for their differences.
+    are equal the interval has zero width, which does not prove equality: use ``wilson`` for rates and
+    ``paired_difference`` for their differences.
 
     Args:
-        values: Array `(observations, ...)`. The statistic receives the rows of the drawn clusters.
+        values: Array ``(observations, ...)``. The statistic receives the rows of the drawn clusters.
         clusters: The cluster of each observation, such as its episode: strings, numbers or tuples of them.
         statistic: A function of such rows that does not depend on their order.
         draws, seed: Number of bootstrap samples and seed of the random generator.
-        vectorized: Whether `statistic` also takes `(draws, observations, ...)` and returns `(draws,)`. Each
-            observation must be a cluster of its own.
+        vectorized: Whether ``statistic`` also takes ``(draws, observations, ...)`` and returns ``(draws,)``.
+            Each observation must be a cluster of its own.
 
     Raises:
-        InputError: `clusters` does not have one entry per observation, there are no observations, or, with
-            `vectorized`, a cluster has several.
+        InputError: ``clusters`` does not have one entry per observation, there are no observations, or, with
+            ``vectorized``, a cluster has several.
 
     Example:
         >>> mean = bootstrap([1.0, 1.0, 3.0, 3.0], ["a", "a", "b", "b"])
@@ -270,11 +270,11 @@ def bootstrap_ratio(
 ) -> Estimate:
     """The ratio of two sums with its percentile interval from a cluster bootstrap.
 
-    Gives the same interval as `bootstrap` with that ratio as its statistic, and is much faster. With all
-    `wholes` equal to 1 it is the mean of `parts`. NaN if `wholes` sum to zero.
+    Gives the same interval as ``bootstrap`` with that ratio as its statistic, and is much faster. With all
+    ``wholes`` equal to 1 it is the mean of ``parts``. NaN if ``wholes`` sum to zero.
 
     Args:
-        parts, wholes: Numerators and denominators, `(observations,)`.
+        parts, wholes: Numerators and denominators, ``(observations,)``.
         clusters: The cluster of each observation.
         draws, seed: Number of bootstrap samples and seed of the random generator.
 
@@ -311,10 +311,10 @@ def detectable_difference(pairs: int, discordant: float) -> float:
             success rate p have 2 p (1 - p).
 
     Returns:
-        The difference of the rates. NaN if even the largest possible one, `discordant`, is not detected.
+        The difference of the rates. NaN if even the largest possible one, ``discordant``, is not detected.
 
     Raises:
-        InputError: `pairs` is below 1, or `discordant` is outside (0, 1].
+        InputError: ``pairs`` is below 1, or ``discordant`` is outside (0, 1].
 
     Example:
         75 episodes per arm, a quarter of them with different outcomes:

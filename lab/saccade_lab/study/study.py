@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from saccade_lab.study.section import Section
     from saccade_lab.study.table import Provenance
 
-#: Every study by name: where its class is, `module:class`, and one line of help. A module is imported when
+#: Every study by name: where its class is, ``module:class``, and one line of help. A module is imported when
 #: its study is chosen. The report has its sections in this order.
 STUDIES: dict[str, tuple[str, str]] = {
     "cuts": (
@@ -65,7 +65,7 @@ class Study(ABC):
     """A question about an action head, and how it is measured.
 
     A study is a frozen dataclass: its fields say what is measured, and on what. It is pickled, so that
-    `measure` can run in other processes.
+    ``measure`` can run in other processes.
 
     Attributes:
         name: Name of the study, of its command and of its table.
@@ -76,7 +76,7 @@ class Study(ABC):
     @classmethod
     @abstractmethod
     def add_arguments(cls, parser: argparse.ArgumentParser) -> None:
-        """Declares the study's own arguments and sets `parser.epilog` to examples."""
+        """Declares the study's own arguments and sets ``parser.epilog`` to examples."""
 
     @classmethod
     @abstractmethod
@@ -84,7 +84,7 @@ class Study(ABC):
         """Creates the study from parsed arguments.
 
         Raises:
-            SaccadeError, OSError: an argument is wrong, or a file that it names is missing.
+            SaccadeError, OSError: An argument is wrong, or a file that it names is missing.
         """
 
     @abstractmethod
@@ -105,9 +105,9 @@ class Study(ABC):
 
     @property
     def files(self) -> tuple[str | Path, ...]:
-        """The files and directories that `measure` reads, as the study's fields name them.
+        """The files and directories that ``measure`` reads, as the study's fields name them.
 
-        They are brought to other machines. Default: those of the field `source`, if there is one.
+        They are brought to other machines. Default: those of the field ``source``, if there is one.
         """
         source = getattr(self, "source", None)
         return source.files if isinstance(source, Source) else ()
@@ -130,7 +130,7 @@ class Study(ABC):
         """The next stage, for studies whose later cells depend on the results of the first ones.
 
         Args:
-            table: table of all cells so far.
+            table: Table of all cells so far.
 
         Returns:
             A study with the same name and settings, whose cells include those of this one; None at the end.
@@ -142,8 +142,8 @@ def load_study(name: str) -> type[Study]:
     """The study of that name.
 
     Raises:
-        InputError: there is no such study. The message lists all studies.
-        TypeError: the entry of `STUDIES` is not a study.
+        InputError: There is no such study. The message lists all studies.
+        TypeError: The entry of ``STUDIES`` is not a study.
     """
     if name not in STUDIES:
         raise InputError(f"study: unknown name {name!r}, expected one of {', '.join(STUDIES)}")

@@ -19,7 +19,7 @@ from saccade.errors import InputError
 
 @dataclass(frozen=True)
 class Provenance:
-    """The provenance of a table; `OUT/<study>.json`.
+    """The provenance of a table; ``OUT/<study>.json``.
 
     Attributes:
         study: Its name.
@@ -58,21 +58,21 @@ def write_table(rows: Iterable[Mapping[str, Any]], path: Path) -> None:
 
 
 def read_table(path: Path) -> pd.DataFrame:
-    """Reads what `write_table` wrote, or the same compressed with `xz`; empty fields are NaN.
+    """Reads what ``write_table`` wrote, or the same compressed with ``xz``; empty fields are NaN.
 
     Raises:
-        FileNotFoundError: the file does not exist.
-        InputError: the file is not CSV.
+        FileNotFoundError: The file does not exist.
+        InputError: The file is not CSV.
     """
     return parse_table(table_content(path), path)
 
 
 def table_content(path: Path) -> bytes:
-    """The bytes of a table, decompressed if its name ends in `.xz`.
+    """The bytes of a table, decompressed if its name ends in ``.xz``.
 
     Raises:
-        FileNotFoundError: the file does not exist.
-        InputError: it cannot be decompressed.
+        FileNotFoundError: The file does not exist.
+        InputError: It cannot be decompressed.
     """
     content = path.read_bytes()
     if path.suffix != ".xz":
@@ -84,7 +84,7 @@ def table_content(path: Path) -> bytes:
 
 
 def parse_table(content: bytes, path: Path) -> pd.DataFrame:
-    """The table in the bytes of a CSV file; `path` names it in an `InputError`."""
+    """The table in the bytes of a CSV file; ``path`` names it in an ``InputError``."""
     if len(content) <= 1:  # a table without rows has no columns
         return pd.DataFrame()
     try:
@@ -95,16 +95,16 @@ def parse_table(content: bytes, path: Path) -> pd.DataFrame:
 
 
 def write_provenance(provenance: Provenance, path: Path) -> None:
-    """Writes it as JSON, with `complete`."""
+    """Writes it as JSON, with ``complete``."""
     write_json(path, {**asdict(provenance), "complete": provenance.complete})
 
 
 def read_provenance(path: Path) -> Provenance:
-    """Reads what `write_provenance` wrote.
+    """Reads what ``write_provenance`` wrote.
 
     Raises:
-        FileNotFoundError: the file does not exist.
-        InputError: the file has other content.
+        FileNotFoundError: The file does not exist.
+        InputError: The file has other content.
     """
     try:
         values = json.loads(path.read_text(encoding="utf-8"))
@@ -115,11 +115,11 @@ def read_provenance(path: Path) -> Provenance:
 
 
 def read_study(out: Path, study: str) -> tuple[pd.DataFrame, Provenance]:
-    """The table of a study and its provenance. The table may be compressed: `OUT/<study>.csv.xz`.
+    """The table of a study and its provenance. The table may be compressed: ``OUT/<study>.csv.xz``.
 
     Raises:
-        FileNotFoundError: one of the two files does not exist.
-        InputError: the table is not the one that the study wrote.
+        FileNotFoundError: One of the two files does not exist.
+        InputError: The table is not the one that the study wrote.
     """
     provenance = read_provenance(provenance_path(out, study))
     path = table_path(out, study)
@@ -139,7 +139,7 @@ def truths(column: pd.Series) -> pd.Series:
     """A column of True and False as booleans.
 
     Raises:
-        InputError: the column contains another value.
+        InputError: The column contains another value.
     """
     values = column.map({True: True, False: False, "True": True, "False": False})
     if values.isna().any():

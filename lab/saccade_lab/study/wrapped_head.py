@@ -7,10 +7,10 @@ from saccade.policy.interfaces import Head
 
 
 class WrappedHead:
-    """What a `saccade.policy.interfaces.Head` says of itself, taken from another head. Subclasses compute.
+    """What a ``saccade.policy.interfaces.Head`` says of itself, taken from another head. Subclasses compute.
 
     Args:
-        head: the head behind it.
+        head: The head behind it.
     """
 
     def __init__(self, head: Head) -> None:
@@ -18,25 +18,25 @@ class WrappedHead:
 
     @property
     def config(self) -> HeadConfig:
-        """See `Head`."""
+        """See ``Head``."""
         return self._wrapped.config
 
     @property
     def source(self) -> str | None:
-        """See `Head`."""
+        """See ``Head``."""
         return self._wrapped.source
 
     @property
     def embodiment_ids(self) -> tuple[int, ...]:
-        """See `Head`."""
+        """See ``Head``."""
         return self._wrapped.embodiment_ids
 
     @property
     def num_threads(self) -> int:
-        """See `Head`."""
+        """See ``Head``."""
         return self._wrapped.num_threads
 
     @property
     def nbytes(self) -> int:
-        """See `Head`."""
+        """See ``Head``."""
         return self._wrapped.nbytes

@@ -30,15 +30,15 @@ class Samples:
     """Observations with their chunks. Only the frames are prepared; nothing else is normalised.
 
     Attributes:
-        images: `(frames, cameras, 3, H, W)` uint8, see `prepared`: every recorded frame once, including those
-            that are only the later frame of a sample.
-        now: `(samples,)` the index in `images` of the observation.
-        later: `(samples,)` the index of the observation after the chunk was executed, see `later_frames`.
-        state: `(samples, 4)` float32, proprioception.
-        targets: `(samples, 6)` float32, positions of object and goal.
-        actions: `(samples, horizon, 4)` float32, zero where not valid.
-        mask: `(samples, horizon, 1)` float32, 1 where an action is valid.
-        tasks: `(samples,)` number of the task in `TASKS`.
+        images: ``(frames, cameras, 3, H, W)`` uint8, see ``prepared``: every recorded frame once, including
+            those that are only the later frame of a sample.
+        now: ``(samples,)`` the index in ``images`` of the observation.
+        later: ``(samples,)`` the index of the observation after the chunk was executed, see ``later_frames``.
+        state: ``(samples, 4)`` float32, proprioception.
+        targets: ``(samples, 6)`` float32, positions of object and goal.
+        actions: ``(samples, horizon, 4)`` float32, zero where not valid.
+        mask: ``(samples, horizon, 1)`` float32, 1 where an action is valid.
+        tasks: ``(samples,)`` number of the task in ``TASKS``.
     """
 
     images: npt.NDArray[np.uint8]
@@ -61,7 +61,7 @@ def chunks(demonstration: demos.Demonstration, horizon: int) -> tuple[Float32Arr
     valid up to and including the first disturbed step.
 
     Returns:
-        `(frames, horizon, 4)` and `(frames, horizon, 1)` of zeros and ones.
+        ``(frames, horizon, 4)`` and ``(frames, horizon, 1)`` of zeros and ones.
     """
     steps = demonstration.frame_steps[:, None] + np.arange(horizon)  # (frames, horizon)
     inside = steps < len(demonstration.actions)
@@ -73,12 +73,12 @@ def chunks(demonstration: demos.Demonstration, horizon: int) -> tuple[Float32Arr
 
 
 def later_frames(demonstration: demos.Demonstration, horizon: int) -> npt.NDArray[np.int64]:
-    """For each frame, the first one that was recorded at least `horizon` control steps later.
+    """For each frame, the first one that was recorded at least ``horizon`` control steps later.
 
     If the demonstration ends before that, this is its last frame: once the task is done nothing moves.
 
     Returns:
-        `(frames,)` indices of frames.
+        ``(frames,)`` indices of frames.
     """
     steps = demonstration.frame_steps
     return np.minimum(np.searchsorted(steps, steps + horizon), len(steps) - 1)
@@ -88,11 +88,11 @@ def prepared(images: npt.NDArray[np.uint8], processor: Processor) -> npt.NDArray
     """Frames as the vision tower sees them, before they are scaled to [-1, 1].
 
     Args:
-        images: `(frames, cameras, H, W, 3)`.
-        processor: processor of the policy.
+        images: ``(frames, cameras, H, W, 3)``.
+        processor: Processor of the policy.
 
     Returns:
-        `(frames, cameras, 3, image_size, image_size)`.
+        ``(frames, cameras, 3, image_size, image_size)``.
     """
     views = [processor.frame(image) for image in images.reshape(-1, *images.shape[2:])]
     pixels = np.rint(np.stack(views) * PIXEL_CENTRE + PIXEL_CENTRE)
@@ -105,14 +105,14 @@ def load_samples(
     """Training and validation samples, split by demonstration.
 
     Args:
-        directory: the demonstrations.
-        tasks: their tasks.
-        horizon: actions in a chunk.
-        processor: processor of the policy, which prepares the frames. None: no frame is read, which saves
-            most of the time, and `images` is `(frames, 0, 3, 0, 0)`.
+        directory: The demonstrations.
+        tasks: Their tasks.
+        horizon: Actions in a chunk.
+        processor: Processor of the policy, which prepares the frames. None: no frame is read, which saves
+            most of the time, and ``images`` is ``(frames, 0, 3, 0, 0)``.
 
     Raises:
-        InputError: a task has no demonstrations.
+        InputError: A task has no demonstrations.
     """
     parts: tuple[list[Samples], list[Samples]] = ([], [])
     for task in tasks:
@@ -165,7 +165,7 @@ def join(parts: list[Samples]) -> Samples:
 
 
 def normalized_actions(normalizer: Normalizer, actions: Float32Array) -> Float32Array:
-    """`(..., T, action_dim)` in the robot's units to what the head is trained on."""
+    """``(..., T, action_dim)`` in the robot's units to what the head is trained on."""
     flat = actions.reshape(-1, *actions.shape[-2:])
     state = np.zeros((len(flat), normalizer.state_width), np.float32)  # no action is relative to it
     return np.asarray(normalizer.previous_chunk(flat, state)).reshape(actions.shape)

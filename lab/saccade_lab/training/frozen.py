@@ -27,11 +27,11 @@ def padded(
     """Prompts padded on the left, as the released processors do, and which tokens are not padding.
 
     Args:
-        prompts: the token ids of each.
-        length: tokens to pad to at least. Default: those of the longest prompt.
+        prompts: The token ids of each.
+        length: Tokens to pad to at least. Default: those of the longest prompt.
 
     Returns:
-        `(B, T)` each.
+        ``(B, T)`` each.
 
     Example:
         >>> ids, mask = padded([np.array([5, 6]), np.array([7])])
@@ -46,7 +46,7 @@ def padded(
 
 
 def pixel_values(images: npt.NDArray[np.uint8]) -> Float32Array:
-    """Frames `(B, cameras, 3, H, W)` as the vision tower takes them, `(B * cameras, 3, H, W)` in [-1, 1]."""
+    """Frames ``(B, cameras, 3, H, W)`` for the vision tower, ``(B * cameras, 3, H, W)`` in [-1, 1]."""
     pixels: Float32Array = (images.astype(np.float32) - PIXEL_CENTRE) / PIXEL_CENTRE
     return pixels.reshape(-1, *pixels.shape[2:])
 
@@ -57,10 +57,10 @@ class FrozenFeatures:
     A frame has one of the wordings of its task here, in turn, so that it has one row of features.
 
     Args:
-        samples: the samples, whose frames are computed.
-        prompts: the token ids of every wording of every task in `TASKS`.
-        backbone: the backbone.
-        path: the file. It is written if it is not there; its name has to identify backbone and recording.
+        samples: The samples, whose frames are computed.
+        prompts: The token ids of every wording of every task in ``TASKS``.
+        backbone: The backbone.
+        path: The file. It is written if it is not there; its name has to identify backbone and recording.
     """
 
     def __init__(

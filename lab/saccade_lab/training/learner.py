@@ -35,10 +35,10 @@ class Batch:
     Attributes:
         inputs: The observations, or the features of a backbone that is not trained; prompts are padded on the
             left, as the released processors do.
-        state: `(B, state_dim)`.
-        actions: `(B, T, action_dim)`.
-        mask: `(B, T, 1)`, 1 where an action is valid.
-        targets: `(B, 6)`, positions of object and goal.
+        state: ``(B, state_dim)``.
+        actions: ``(B, T, action_dim)``.
+        mask: ``(B, T, 1)``, 1 where an action is valid.
+        targets: ``(B, 6)``, positions of object and goal.
         later: With alignment, the observations after the chunk was executed.
     """
 
@@ -55,15 +55,15 @@ class Learner(nn.Module):
 
     In addition to the policy there is a layer that predicts object and goal positions, whose loss makes the
     backbone locate them early in training: a linear one on the last token of the prompt, which has seen all
-    others, or :class:`ImageTargets` where the backbone is trained alone. With an `alignment_block` there is
+    others, or :class:`ImageTargets` where the backbone is trained alone. With an ``alignment_block`` there is
     also a projector from the hidden rows of the future tokens to the backbone's features one horizon later.
     None of them is part of the checkpoint.
 
     Args:
-        backbone_sizes: sizes of the backbone.
-        head_config: sizes of the head.
-        alignment_block: block of the head after which the future rows are aligned; None for no alignment.
-        only: what is trained, see `TrainingSettings`.
+        backbone_sizes: Sizes of the backbone.
+        head_config: Sizes of the head.
+        alignment_block: Block of the head after which the future rows are aligned; None for no alignment.
+        only: What is trained, see ``TrainingSettings``.
     """
 
     def __init__(
@@ -99,13 +99,13 @@ class Learner(nn.Module):
         """All losses of a batch.
 
         Args:
-            batch: the samples.
-            generator: generator of noise and times.
-            average: the averaged tensors of the policy, whose backbone encodes the later observations.
+            batch: The samples.
+            generator: Generator of noise and times.
+            average: The averaged tensors of the policy, whose backbone encodes the later observations.
 
         Returns:
-            Scalars: `loss` of flow matching, or of the positions where the backbone is trained alone;
-            `target_loss` of the positions where both are trained; with alignment `alignment_loss`.
+            Scalars: ``loss`` of flow matching, or of the positions where the backbone is trained alone;
+            ``target_loss`` of the positions where both are trained; with alignment ``alignment_loss``.
         """
         seen = self.seen(batch.inputs)
         features = seen.backbone_features  # (B, S, width)
@@ -146,11 +146,11 @@ class Learner(nn.Module):
         """The targets of the future rows: what the averaged backbone sees later.
 
         Args:
-            later: see `Batch`.
-            average: see `losses`.
+            later: See ``Batch``.
+            average: See ``losses``.
 
         Returns:
-            `(B, N, width)`: the image tokens, averaged over N runs of neighbours.
+            ``(B, N, width)``: the image tokens, averaged over N runs of neighbours.
         """
         if isinstance(later, BackboneInputs):
             prefix = "backbone."
@@ -166,7 +166,7 @@ class Learner(nn.Module):
 
     @contextmanager
     def watched_rows(self) -> Iterator[list[Tensor]]:
-        """Collects the rows `(B, R, width)` that the alignment block returns; none without alignment."""
+        """Collects the rows ``(B, R, width)`` that the alignment block returns; none without alignment."""
         rows: list[Tensor] = []
         if self.alignment_block is None:
             yield rows
@@ -192,7 +192,7 @@ def new_learner(settings: TrainingSettings, config: PolicyConfig) -> Learner:
 
     Runs of one seed that differ in N start from the same weights of everything else, and the tokens of the
     smaller N are the first ones of the larger N. So policies can be compared in pairs of one seed. With
-    another `category_std`, the category-specific weights are the same numbers on another scale.
+    another ``category_std``, the category-specific weights are the same numbers on another scale.
     """
     sizes, head, block = config.backbone_sizes, config.head_config, settings.aligned_block
     torch.manual_seed(settings.seed)
@@ -215,7 +215,7 @@ def new_learner(settings: TrainingSettings, config: PolicyConfig) -> Learner:
 
 @torch.no_grad()
 def scale_categories(module: nn.Module, std: float) -> None:
-    """Gives the new category-specific weights of a module another standard deviation than `TABLE_STD`."""
+    """Gives the new category-specific weights of a module another standard deviation than ``TABLE_STD``."""
     for inner in module.modules():
         if isinstance(inner, CategoryLinear):
             inner.W.mul_(std / TABLE_STD)
@@ -234,18 +234,18 @@ class ImageTargets(nn.Module):
         self.positions = nn.Linear(NUM_QUERIES * width, NUM_TARGETS)
 
     def forward(self, features: BackboneFeatures) -> Tensor:
-        """`(B, 6)`."""
+        """``(B, 6)``."""
         tokens = image_tokens(features)  # (B, image tokens, width)
         weights = self.queries(tokens).softmax(dim=1)  # (B, image tokens, queries)
         return self.positions((weights.transpose(1, 2) @ tokens).flatten(1))
 
 
 def image_tokens(features: BackboneFeatures) -> Tensor:
-    """The features of the image tokens, `(B, image tokens, width)`."""
+    """The features of the image tokens, ``(B, image tokens, width)``."""
     tokens = features.backbone_features
     return tokens[features.image_mask].unflatten(0, (len(tokens), -1))
 
 
 def pool_tokens(tokens: Tensor, count: int) -> Tensor:
-    """`(B, S, width)` to `(B, count, width)`: means over runs of neighbours that cover all tokens."""
+    """``(B, S, width)`` to ``(B, count, width)``: means over runs of neighbours that cover all tokens."""
     return F.adaptive_avg_pool1d(tokens.transpose(1, 2), count).transpose(1, 2)

@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 from saccade.errors import InputError
 
-#: What `saccade train` writes only to continue a run.
+#: What ``saccade train`` writes only to continue a run.
 STATE_FILE = "training.pt"
 
 
@@ -25,16 +25,16 @@ def features_name(start_sha256: str, recording_sha256: str, samples: str) -> str
 
 CATEGORY_STD = 0.02  # of the released code: `saccade_lab.reference.layers.TABLE_STD`, which needs torch
 RELEASED_WIDTH = 1536  # of GR00T N1.5
-#: Settings that were added after the first runs; see `TrainingSettings.to_dict`.
+#: Settings that were added after the first runs; see ``TrainingSettings.to_dict``.
 ADDED = ("category_std",)
 
 
 def released_std(width: int) -> float:
-    """The `category_std` with which a layer whose input has this width begins on the scale of GR00T N1.5.
+    """The ``category_std`` with which a layer whose input has this width begins on the scale of GR00T N1.5.
 
     What a linear layer returns grows with the square root of the width of its input. With the released 0.02,
     the encoded actions of a head of width 64 begin much smaller than their positions, which they do not in
-    GR00T N1.5 (`studies/why-32/initial_scale.py`).
+    GR00T N1.5 (``studies/why-32/initial_scale.py``).
 
     Example:
         >>> released_std(1536), round(released_std(64), 3)
@@ -64,11 +64,11 @@ class TrainingSettings:
         absent_share: Share of frames that get the instruction of a task whose object is absent, with standing
             still as the action. Without them the images alone distinguish most tasks, and the policy ignores
             the words.
-        start_sha256: Hash of the tensors that the run starts from; empty for random ones. `train` sets it.
+        start_sha256: Hash of the tensors that the run starts from; empty for random ones. ``train`` sets it.
         seed: Seed of initial weights, order and noise.
         category_std: Standard deviation of the initial category-specific weights, those of the state encoder
             and of the encoder and the decoder of the actions. 0.02 is that of the released code, which is
-            used at a width of 1536; see `released_std`.
+            used at a width of 1536; see ``released_std``.
         blind: Whether all pictures are black, for a policy that shows what can be done without them.
         width, num_layers, num_heads: Sizes of the head; the language model has as many heads.
         language_width: Width of the language model, and of the head's VL self-attention on its features; 0

@@ -1,11 +1,11 @@
 """Training the policy on demonstrations: flow matching on action chunks, in torch, on the CPU.
 
-A run is a directory with `training.pt` (all that is needed to continue), the policy so far (`config.json`,
-`model.safetensors`, `tokenizer.json`, `experiment_cfg/metadata.json`), `settings.json` (settings and
-demonstrations), `history.json` and `loss.png`. They are written about once a minute, each under a temporary
-name that is then renamed, so that a run can be interrupted at any time and continued. Every step draws its
-samples and noise from the seed and the number of the step, so that a continued run gives the same weights as
-an uninterrupted one.
+A run is a directory with ``training.pt`` (all that is needed to continue), the policy so far
+(``config.json``, ``model.safetensors``, ``tokenizer.json``, ``experiment_cfg/metadata.json``),
+``settings.json`` (settings and demonstrations), ``history.json`` and ``loss.png``. They are written about
+once a minute, each under a temporary name that is then renamed, so that a run can be interrupted at any time
+and continued. Every step draws its samples and noise from the seed and the number of the step, so that a
+continued run gives the same weights as an uninterrupted one.
 """
 
 # Calls of torch modules are untyped.
@@ -137,7 +137,7 @@ def with_statistics(config: PolicyConfig, samples: Samples) -> PolicyConfig:
 
 
 def new_run(settings: TrainingSettings, config: PolicyConfig, demonstrations: dict[str, Any]) -> Run:
-    """A run before its first step; for `demonstrations` see `dataset.describe`."""
+    """A run before its first step; for ``demonstrations`` see ``dataset.describe``."""
     learner = new_learner(settings, config)
     matrices = [parameter for parameter in learner.parameters() if parameter.ndim >= 2]
     others = [parameter for parameter in learner.parameters() if parameter.ndim < 2]
@@ -161,14 +161,14 @@ class Batches:
     """Draws batches.
 
     Args:
-        samples: the samples to draw from.
-        config: config of the policy.
-        prompts: what `prompts_of` returns.
-        targets: mean and standard deviation of the positions, `(6,)` each.
-        batch_size: frames per batch.
-        absent_share: see `TrainingSettings`.
-        frozen: the features of the samples' frames, if the backbone is not trained.
-        with_later: whether batches contain the observations after the chunk was executed.
+        samples: The samples to draw from.
+        config: Config of the policy.
+        prompts: What ``prompts_of`` returns.
+        targets: Mean and standard deviation of the positions, ``(6,)`` each.
+        batch_size: Frames per batch.
+        absent_share: See ``TrainingSettings``.
+        frozen: The features of the samples' frames, if the backbone is not trained.
+        with_later: Whether batches contain the observations after the chunk was executed.
     """
 
     def __init__(
@@ -201,7 +201,7 @@ class Batches:
         self._still = normalized_actions(normalizer, np.zeros(samples.actions.shape[1:], np.float32))
 
     def draw(self, *key: int) -> Batch:
-        """The batch of `key`, with a wording drawn for each frame."""
+        """The batch of ``key``, with a wording drawn for each frame."""
         rng = np.random.default_rng(key)
         rows = rng.integers(len(self._samples), size=self._batch_size)
         tasks, later = self._samples.tasks[rows], self._samples.later[rows]
@@ -231,7 +231,7 @@ class Batches:
 
 
 def prompts_of(config: PolicyConfig, processor: Processor) -> list[list[npt.NDArray[np.int64]]]:
-    """The token ids `(T,)` of every wording of every task in `TASKS`."""
+    """The token ids ``(T,)`` of every wording of every task in ``TASKS``."""
     shown = np.zeros((config.simulation.image_size, config.simulation.image_size, 3), np.uint8)
     frames = [shown] * len(config.simulation.cameras)
     return [[processor(frames, text).input_ids[0] for text in task.instructions] for task in TASKS.values()]
@@ -316,7 +316,7 @@ def resume(run: Run, path: Path) -> None:
     """Continues a run from a saved state.
 
     Raises:
-        InputError: it was started with other settings or other demonstrations.
+        InputError: It was started with other settings or other demonstrations.
     """
     state = torch.load(path, weights_only=True)
     settings = run.settings.to_dict()
@@ -335,8 +335,8 @@ def config_of_start(config: PolicyConfig, policy: Path, only: str = "") -> Polic
     """The config with the statistics of the policy to start from: its weights know no others.
 
     Raises:
-        FileNotFoundError: there is no policy.
-        InputError: the policy has other sizes, tasks or cameras. The head may have other sizes where it alone
+        FileNotFoundError: There is no policy.
+        InputError: The policy has other sizes, tasks or cameras. The head may have other sizes where it alone
             is trained.
     """
     found, statistics = (json.loads((policy / name).read_text()) for name in (CONFIG_FILE, METADATA_FILE))
@@ -363,7 +363,7 @@ def start_from(run: Run, policy: Path) -> None:
 
 
 def features_of(samples: str, settings: TrainingSettings, recorded: dict[str, Any], out: Path) -> Path:
-    """The file with the features of the training or validation frames; see `FrozenFeatures`."""
+    """The file with the features of the training or validation frames; see ``FrozenFeatures``."""
     shown = f"{samples}-blind" if settings.blind else samples
     return out.parent / features_name(settings.start_sha256, recorded["sha256"], shown)
 
@@ -376,22 +376,22 @@ def train(
     *,
     start: Path | None = None,
 ) -> PolicyConfig:
-    """Trains a policy, or continues the run in `out`. With glibc, the process then keeps freed memory.
+    """Trains a policy, or continues the run in ``out``. With glibc, the process then keeps freed memory.
 
     Args:
-        demonstrations: directory written by `saccade demos`.
-        out: directory of the run.
-        settings: settings of the run.
-        on_step: called after each step.
-        start: a policy to start from; None for random weights. Where only the head is trained, the features
-            of its backbone are kept in files beside `out`, for other runs.
+        demonstrations: Directory written by ``saccade demos``.
+        out: Directory of the run.
+        settings: Settings of the run.
+        on_step: Called after each step.
+        start: A policy to start from; None for random weights. Where only the head is trained, the features
+            of its backbone are kept in files beside ``out``, for other runs.
 
     Returns:
         The config of the policy.
 
     Raises:
-        FileNotFoundError: there are no demonstrations, or no policy to start from.
-        InputError: demonstrations with different settings, or `out` contains a run with other settings.
+        FileNotFoundError: There are no demonstrations, or no policy to start from.
+        InputError: Demonstrations with different settings, or ``out`` contains a run with other settings.
     """
     if settings.only == "head" and start is None:
         raise InputError("start: given none, expected a policy, since only the head is trained")

@@ -12,12 +12,12 @@ def attend(queries: Tensor, keys: Tensor, values: Tensor, allowed: Tensor | None
     """Attention of each query to the keys that it is allowed to see.
 
     Args:
-        queries: `(..., heads, Q, head_dim)`.
-        keys, values: `(..., heads, K, head_dim)`.
-        allowed: bool, broadcast over the heads: `(..., 1, Q, K)`. Default: every key.
+        queries: ``(..., heads, Q, head_dim)``.
+        keys, values: ``(..., heads, K, head_dim)``.
+        allowed: Bool, broadcast over the heads: ``(..., 1, Q, K)``. Default: every key.
 
     Returns:
-        `(..., Q, heads * head_dim)`. A query without any allowed key gets zeros, as in torch's SDPA.
+        ``(..., Q, heads * head_dim)``. A query without any allowed key gets zeros, as in torch's SDPA.
     """
     logits = queries @ keys.transpose(-1, -2) / math.sqrt(queries.shape[-1])  # (..., heads, Q, K)
     if allowed is not None:
@@ -30,5 +30,5 @@ def attend(queries: Tensor, keys: Tensor, values: Tensor, allowed: Tensor | None
 
 
 def split_heads(x: Tensor, head_dim: int) -> Tensor:
-    """`(..., rows, heads * head_dim)` to `(..., heads, rows, head_dim)`."""
+    """``(..., rows, heads * head_dim)`` to ``(..., heads, rows, head_dim)``."""
     return x.unflatten(-1, (-1, head_dim)).transpose(-2, -3)

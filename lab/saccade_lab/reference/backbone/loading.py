@@ -47,10 +47,10 @@ class Checkpoint:
         return cls(path, files, BackboneSizes.from_config(values))
 
     def read(self, expected: Mapping[str, torch.Size], dtype: torch.dtype) -> dict[str, Tensor]:
-        """The backbone's tensors in `dtype`, by their names below ``backbone.``.
+        """The backbone's tensors in ``dtype``, by their names below ``backbone.``.
 
         Raises:
-            CheckpointError: tensors are missing, unknown or of the wrong shape. The message lists all.
+            CheckpointError: Tensors are missing, unknown or of the wrong shape. The message lists all.
         """
         tensors: dict[str, Tensor] = {}
         twin: Tensor | None = None
@@ -84,8 +84,8 @@ class Checkpoint:
 def is_unread(name: str, sizes: BackboneSizes) -> bool:
     """Whether a tensor below ``backbone.`` is known and not read.
 
-    That are those of `backbone_tensors.unread_tensor_shapes`, a twin of the embedding table, and layers that
-    are not computed.
+    That are those of ``backbone_tensors.unread_tensor_shapes``, a twin of the embedding table, and layers
+    that are not computed.
     """
     if name.endswith("lm_head.weight") or ".vision_model.head." in name:
         return True

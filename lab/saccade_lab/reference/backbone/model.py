@@ -1,7 +1,7 @@
 """The GR00T backbones as torch modules: camera frames and a prompt in, features of the action head out.
 
-Module names follow the checkpoint, so that `state_dict()` has the released names below ``backbone.``. Shapes
-in comments: B is the batch, T the tokens of a prompt, N the image tokens of all views.
+Module names follow the checkpoint, so that ``state_dict()`` has the released names below ``backbone.``.
+Shapes in comments: B is the batch, T the tokens of a prompt, N the image tokens of all views.
 """
 
 # Calls of torch modules are untyped.
@@ -50,13 +50,13 @@ class BackboneFeatures:
 class Backbone(nn.Module):
     """The backbone of GR00T N1.5, N1.6 or N1.7 in torch.
 
-    It computes in the dtype of its parameters (`.double()` for float64) and is differentiable in all of them.
-    Nothing is cached or skipped, and logits are not computed. In a padded batch, padded rows attend to
-    nothing, as in the released code under torch's SDPA. Wrap calls in `torch.no_grad()` if no gradient is
+    It computes in the dtype of its parameters (``.double()`` for float64) and is differentiable in all of
+    them. Nothing is cached or skipped, and logits are not computed. In a padded batch, padded rows attend to
+    nothing, as in the released code under torch's SDPA. Wrap calls in ``torch.no_grad()`` if no gradient is
     needed.
 
     Args:
-        sizes: sizes and switches.
+        sizes: Sizes and switches.
 
     Example:
         >>> import numpy as np
@@ -96,8 +96,8 @@ class Backbone(nn.Module):
                 :meth:`saccade.Backbone.from_pretrained` reads, or the id of a published checkpoint.
             revision: A branch, tag or commit of the id. Default: ``main``.
             config: As for :meth:`saccade.checkpoints.backbone_sizes.BackboneSizes.from_config`, or the path
-                of such a file. Default: the `config.json` in the same directory, or else the `about` entry
-                in the metadata of a single file.
+                of such a file. Default: the ``config.json`` in the same directory, or else the ``about``
+                entry in the metadata of a single file.
             dtype: Dtype of the parameters. Narrower stored dtypes are widened, which is exact.
 
         Raises:
@@ -122,8 +122,8 @@ class Backbone(nn.Module):
         """Computes the features of a batch.
 
         Raises:
-            ShapeError: pixel values do not have the shape that the version takes.
-            InputError: a token is not in the table, or the image tokens of the prompts are not those of the
+            ShapeError: Pixel values do not have the shape that the version takes.
+            InputError: A token is not in the table, or the image tokens of the prompts are not those of the
                 views.
         """
         ids = torch.from_numpy(inputs.input_ids)  # (B, T)
@@ -151,7 +151,7 @@ class Eagle(nn.Module):
         self.language_model = LanguageModel(sizes.text, sizes.num_layers)
 
     def forward(self, inputs: BackboneInputs, ids: Tensor, mask: Tensor) -> Tensor:
-        """Inputs with their ids and mask, `(B, T)`, to `(B, T, width)`."""
+        """Inputs with their ids and mask, ``(B, T)``, to ``(B, T, width)``."""
         decoder = self.language_model.model
         weight = decoder.embed_tokens.weight
         tokens = [self.image_tokens(views.to(weight)) for views in self.views(inputs)]
@@ -163,7 +163,7 @@ class Eagle(nn.Module):
         return decoder(x, angles, mask)
 
     def views(self, inputs: BackboneInputs) -> list[Tensor]:
-        """The views, together where they have the same size: each `(V, 3, height, width)`."""
+        """The views, together where they have the same size: each ``(V, 3, height, width)``."""
         pixels = inputs.pixel_values
         grouped = [torch.from_numpy(view) for view in (pixels if isinstance(pixels, tuple) else [pixels])]
         side = self.sizes.vision.patch_size * self.sizes.merge
@@ -181,7 +181,7 @@ class Eagle(nn.Module):
         return grouped
 
     def image_tokens(self, views: Tensor) -> Tensor:
-        """`(V, 3, height, width)` to `(V * tokens of a view, width)`."""
+        """``(V, 3, height, width)`` to ``(V * tokens of a view, width)``."""
         sizes = self.sizes
         rows, columns = (side // sizes.vision.patch_size for side in views.shape[2:])
         patches = self.vision_model(views)  # (V, rows * columns, vision_width)
@@ -201,7 +201,7 @@ class Qwen3VlModel(nn.Module):
         self.language_model = Decoder(sizes.text, sizes.num_layers, last_norm=False)
 
     def forward(self, inputs: BackboneInputs, ids: Tensor, mask: Tensor) -> Tensor:
-        """Inputs with their ids and mask, `(B, T)`, to `(B, T, width)`."""
+        """Inputs with their ids and mask, ``(B, T)``, to ``(B, T, width)``."""
         sizes, decoder = self.sizes, self.language_model
         weight = decoder.embed_tokens.weight
         patches, grids = self.patches(inputs)
@@ -214,7 +214,7 @@ class Qwen3VlModel(nn.Module):
         return decoder(x, angles, mask, added_after(stacked, image_mask))
 
     def patches(self, inputs: BackboneInputs) -> tuple[Tensor, list[tuple[int, int]]]:
-        """The patches of all views, `(P, values)`, and the grid of each view."""
+        """The patches of all views, ``(P, values)``, and the grid of each view."""
         vision, pixels = self.sizes.vision, inputs.pixel_values
         values = 3 * vision.temporal_patch_size * vision.patch_size**2
         if isinstance(pixels, tuple) or pixels.ndim != 2 or pixels.shape[1] != values:
@@ -241,7 +241,7 @@ class Qwen3Vl(nn.Module):
         self.model = Qwen3VlModel(sizes)
 
     def forward(self, inputs: BackboneInputs, ids: Tensor, mask: Tensor) -> Tensor:
-        """As `Qwen3VlModel`."""
+        """As ``Qwen3VlModel``."""
         return self.model(inputs, ids, mask)
 
 
@@ -249,12 +249,12 @@ def with_image_tokens(x: Tensor, image_mask: Tensor, tokens: Tensor) -> Tensor:
     """Embedded tokens whose image positions are replaced, prompt after prompt.
 
     Args:
-        x: `(B, T, width)`.
-        image_mask: bool `(B, T)`.
-        tokens: `(N, width)`.
+        x: ``(B, T, width)``.
+        image_mask: Bool ``(B, T)``.
+        tokens: ``(N, width)``.
 
     Raises:
-        InputError: there are not as many image positions as image tokens.
+        InputError: There are not as many image positions as image tokens.
     """
     places = int(image_mask.sum())
     if places != tokens.shape[0]:
@@ -265,7 +265,7 @@ def with_image_tokens(x: Tensor, image_mask: Tensor, tokens: Tensor) -> Tensor:
 
 
 def added_after(stacked: list[Tensor], image_mask: Tensor) -> Callable[[int, Tensor], Tensor]:
-    """Adds the deepstack tokens of layer i, `(N, width)`, to its output at image positions."""
+    """Adds the deepstack tokens of layer i, ``(N, width)``, to its output at image positions."""
 
     def add(index: int, x: Tensor) -> Tensor:
         if index >= len(stacked):

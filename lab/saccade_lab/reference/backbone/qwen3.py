@@ -26,7 +26,7 @@ class RmsNorm(nn.Module):
         self.eps = eps
 
     def forward(self, x: Tensor) -> Tensor:
-        """`(..., width)` to the same shape."""
+        """``(..., width)`` to the same shape."""
         return self.weight * (x * torch.rsqrt(x.square().mean(dim=-1, keepdim=True) + self.eps))
 
 
@@ -48,7 +48,7 @@ class SelfAttention(nn.Module):
         self.k_norm = RmsNorm(sizes.head_dim, sizes.eps)
 
     def forward(self, x: Tensor, angles: Tensor, allowed: Tensor) -> Tensor:
-        """`x (B, T, width)`, `angles (B, T, head_dim / 2)`, bool `allowed (B, T, T)`; to `(B, T, width)`."""
+        """``x (B, T, width)``, ``angles (B, T, head_dim / 2)``, bool ``allowed (B, T, T)``; to its shape."""
         angles = angles[:, None]  # the same for all heads
         q = rotate(self.q_norm(split_heads(self.q_proj(x), self.head_dim)), angles)  # (B, heads, T, head_dim)
         k = rotate(self.k_norm(split_heads(self.k_proj(x), self.head_dim)), angles)  # (B, key heads, T, ...)
@@ -68,7 +68,7 @@ class Mlp(nn.Module):
         self.down_proj = nn.Linear(sizes.mlp_width, sizes.width, bias=False)
 
     def forward(self, x: Tensor) -> Tensor:
-        """`(..., width)` to the same shape."""
+        """``(..., width)`` to the same shape."""
         return self.down_proj(F.silu(self.gate_proj(x)) * self.up_proj(x))
 
 
@@ -83,7 +83,7 @@ class DecoderLayer(nn.Module):
         self.mlp = Mlp(sizes)
 
     def forward(self, x: Tensor, angles: Tensor, allowed: Tensor) -> Tensor:
-        """`x (B, T, width)` to the same shape; the others are as in `SelfAttention`."""
+        """``x (B, T, width)`` to the same shape; the others are as in ``SelfAttention``."""
         x = x + self.self_attn(self.input_layernorm(x), angles, allowed)
         return x + self.mlp(self.post_attention_layernorm(x))
 
@@ -108,13 +108,13 @@ class Decoder(nn.Module):
         """The hidden state behind the last layer.
 
         Args:
-            x: embedded tokens and image tokens, `(B, T, width)`.
-            angles: rotary angles, `(B, T, head_dim / 2)`.
-            attention_mask: bool `(B, T)`; no token attends to the others.
-            after_layer: replaces the output of a layer, given its index.
+            x: Embedded tokens and image tokens, ``(B, T, width)``.
+            angles: Rotary angles, ``(B, T, head_dim / 2)``.
+            attention_mask: Bool ``(B, T)``; no token attends to the others.
+            after_layer: Replaces the output of a layer, given its index.
 
         Returns:
-            `(B, T, width)`.
+            ``(B, T, width)``.
         """
         num_tokens = x.shape[1]
         causal = torch.ones(num_tokens, num_tokens, dtype=torch.bool, device=x.device).tril()  # (T, T)

@@ -25,7 +25,7 @@ class PatchEmbedding(nn.Module):
         self.proj = nn.Conv3d(3, sizes.width, kernel_size=self.shape[1:], stride=self.shape[1:])
 
     def forward(self, patches: Tensor) -> Tensor:
-        """`(P, values)` to `(P, vision_width)`."""
+        """``(P, values)`` to ``(P, vision_width)``."""
         return self.proj(patches.unflatten(1, self.shape)).flatten(1)
 
 
@@ -39,7 +39,7 @@ class SelfAttention(nn.Module):
         self.proj = nn.Linear(sizes.width, sizes.width)
 
     def forward(self, x: Tensor, angles: Tensor, lengths: list[int]) -> Tensor:
-        """`x (P, vision_width)`, `angles (P, head_dim / 2)`, the patches of each view; to `x`'s shape."""
+        """``x (P, vision_width)``, ``angles (P, head_dim / 2)``, the patches of each view; to its shape."""
         q, k, v = (split_heads(part, self.head_dim) for part in self.qkv(x).chunk(3, dim=-1))
         q, k = rotate(q, angles), rotate(k, angles)  # (heads, P, head_dim)
         views = zip(q.split(lengths, 1), k.split(lengths, 1), v.split(lengths, 1), strict=True)
@@ -55,7 +55,7 @@ class Mlp(nn.Module):
         self.linear_fc2 = nn.Linear(sizes.mlp_width, sizes.width)
 
     def forward(self, x: Tensor) -> Tensor:
-        """`(P, vision_width)` to the same shape."""
+        """``(P, vision_width)`` to the same shape."""
         return self.linear_fc2(F.gelu(self.linear_fc1(x), approximate="tanh"))
 
 
@@ -70,7 +70,7 @@ class Block(nn.Module):
         self.mlp = Mlp(sizes)
 
     def forward(self, x: Tensor, angles: Tensor, lengths: list[int]) -> Tensor:
-        """`x (P, vision_width)` to the same shape; the others are as in `SelfAttention`."""
+        """``x (P, vision_width)`` to the same shape; the others are as in ``SelfAttention``."""
         x = x + self.attn(self.norm1(x), angles, lengths)
         return x + self.mlp(self.norm2(x))
 
@@ -91,7 +91,7 @@ class Merger(nn.Module):
         self.linear_fc2 = nn.Linear(self.joined, sizes.text.width)
 
     def forward(self, x: Tensor) -> Tensor:
-        """`(P, vision_width)`, the patches of a square together, to `(image tokens, width)`."""
+        """``(P, vision_width)``, the patches of a square together, to ``(image tokens, width)``."""
         joined = (-1, self.joined)
         x = self.norm(x.reshape(joined)) if self.norm_joined else self.norm(x).reshape(joined)
         return self.linear_fc2(F.gelu(self.linear_fc1(x)))  # the exact GELU, by erf
@@ -116,11 +116,11 @@ class VisionTower(nn.Module):
         """The image tokens of all views.
 
         Args:
-            patches: `(P, values)`, square after square.
-            grids: rows and columns of patches of each view.
+            patches: ``(P, values)``, square after square.
+            grids: Rows and columns of patches of each view.
 
         Returns:
-            The image tokens `(N, width)`, and as many again for each deepstack layer.
+            The image tokens ``(N, width)``, and as many again for each deepstack layer.
         """
         places = [patch_places(rows, columns, self.merge) for rows, columns in grids]
         x = self.patch_embed(patches)
@@ -141,11 +141,11 @@ class VisionTower(nn.Module):
         """The table at places of a view, bilinear between its entries.
 
         Args:
-            num_rows, num_columns: the grid of the view, stretched over the whole table.
-            rows, columns: places on that grid, `(patches,)`.
+            num_rows, num_columns: The grid of the view, stretched over the whole table.
+            rows, columns: Places on that grid, ``(patches,)``.
 
         Returns:
-            `(patches, vision_width)`.
+            ``(patches, vision_width)``.
         """
         table = self.pos_embed.weight
         side = round(table.shape[0] ** 0.5)
@@ -160,7 +160,7 @@ class VisionTower(nn.Module):
 
 
 def patch_places(rows: int, columns: int, merge: int) -> tuple[Tensor, Tensor]:
-    """Row and column of each patch of a view, square after square as in the inputs, `(patches,)`."""
+    """Row and column of each patch of a view, square after square as in the inputs, ``(patches,)``."""
     row = torch.arange(rows)[:, None].expand(rows, columns)
     column = torch.arange(columns).expand(rows, columns)
 
@@ -179,16 +179,16 @@ def prompt_positions(
     (p, p + r, p + c), and the next number is p plus the longer side of its grid. Padding has 1.
 
     Args:
-        input_ids: `(B, T)`.
-        attention_mask: bool `(B, T)`.
-        grids: rows and columns of patches of each view, those of the first prompt first.
-        sizes: of the backbone.
+        input_ids: ``(B, T)``.
+        attention_mask: Bool ``(B, T)``.
+        grids: Rows and columns of patches of each view, those of the first prompt first.
+        sizes: Of the backbone.
 
     Returns:
-        int64 `(3, B, T)`.
+        Int64 ``(3, B, T)``.
 
     Raises:
-        InputError: the image tokens of a prompt are not those of its views.
+        InputError: The image tokens of a prompt are not those of its views.
     """
     positions = torch.ones((3, *input_ids.shape), dtype=torch.long)
     remaining = iter(grids)

@@ -7,11 +7,11 @@ from torch import Tensor
 
 
 def rotate(x: Tensor, angles: Tensor) -> Tensor:
-    """Rotates the pairs `(k, k + half)` of the last axis.
+    """Rotates the pairs ``(k, k + half)`` of the last axis.
 
     Args:
-        x: `(..., rows, 2 * half)`.
-        angles: `(..., rows, half)`, broadcast.
+        x: ``(..., rows, 2 * half)``.
+        angles: ``(..., rows, half)``, broadcast.
     """
     cos, sin = angles.cos().to(x.dtype), angles.sin().to(x.dtype)
     first, second = x.chunk(2, dim=-1)
@@ -19,13 +19,13 @@ def rotate(x: Tensor, angles: Tensor) -> Tensor:
 
 
 def frequencies(theta: float, half: int, dtype: torch.dtype) -> Tensor:
-    """`theta ** (-k / half)` for k from 0, `(half,)`, in float32 or wider."""
+    """``theta ** (-k / half)`` for k from 0, ``(half,)``, in float32 or wider."""
     exponents = torch.arange(half, dtype=torch.float64) / half
     return (theta**-exponents).to(torch.promote_types(dtype, torch.float32))
 
 
 def text_angles(positions: Tensor, theta: float, half: int, dtype: torch.dtype) -> Tensor:
-    """Angles of positions on one axis, `(...)` to `(..., half)`."""
+    """Angles of positions on one axis, ``(...)`` to ``(..., half)``."""
     inverse = frequencies(theta, half, dtype)
     return positions[..., None].to(inverse.dtype) * inverse
 
@@ -39,14 +39,14 @@ def interleaved_angles(
     section of that axis has, and else the time axis.
 
     Args:
-        positions: `(3, ...)`: time, height, width.
-        theta: base of the frequencies.
-        half: number of angles.
-        sections: number of angles of each axis; they add up to `half`.
-        dtype: dtype of the model.
+        positions: ``(3, ...)``: time, height, width.
+        theta: Base of the frequencies.
+        half: Number of angles.
+        sections: Number of angles of each axis; they add up to ``half``.
+        dtype: Dtype of the model.
 
     Returns:
-        `(..., half)`.
+        ``(..., half)``.
     """
     angles = text_angles(positions, theta, half, dtype)  # (3, ..., half)
     k = torch.arange(half)
@@ -61,12 +61,12 @@ def grid_angles(rows: Tensor, columns: Tensor, half: int, dtype: torch.dtype) ->
     """Angles of patches on a grid: half of them by row, half by column.
 
     Args:
-        rows, columns: `(patches,)`.
-        half: number of angles, even.
-        dtype: dtype of the model.
+        rows, columns: ``(patches,)``.
+        half: Number of angles, even.
+        dtype: Dtype of the model.
 
     Returns:
-        `(patches, half)`.
+        ``(patches, half)``.
     """
     by_row = text_angles(rows, 10000.0, half // 2, dtype)
     by_column = text_angles(columns, 10000.0, half // 2, dtype)

@@ -23,7 +23,7 @@ class ConvolutionEmbeddings(nn.Module):
         self.position_embedding = nn.Embedding(sizes.num_positions, sizes.width)
 
     def forward(self, pixels: Tensor) -> Tensor:
-        """`(V, 3, height, width)` to `(V, P, vision_width)`."""
+        """``(V, 3, height, width)`` to ``(V, P, vision_width)``."""
         patches = self.patch_embedding(pixels).flatten(2).transpose(1, 2)  # row by row
         return patches + self.position_embedding.weight
 
@@ -38,7 +38,7 @@ class LinearEmbeddings(nn.Module):
         self.position_embedding = nn.Embedding(sizes.num_positions, sizes.width)
 
     def forward(self, pixels: Tensor) -> Tensor:
-        """`(V, 3, height, width)` to `(V, P, vision_width)`."""
+        """``(V, 3, height, width)`` to ``(V, P, vision_width)``."""
         side = self.patch_size
         patches = pixels.unflatten(3, (-1, side)).unflatten(2, (-1, side))  # (V, 3, rows, y, columns, x)
         patches = patches.permute(0, 2, 4, 3, 5, 1)  # (V, rows, columns, y, x, 3)
@@ -47,7 +47,7 @@ class LinearEmbeddings(nn.Module):
         return self.patch_embedding(patches) + self.positions(*grid)
 
     def positions(self, rows: int, columns: int) -> Tensor:
-        """The table resized to a grid with antialiased linear filters, `(rows * columns, vision_width)`."""
+        """The table resized to a grid with antialiased linear filters, ``(rows * columns, vision_width)``."""
         table = self.position_embedding.weight
         side = round(table.shape[0] ** 0.5)
         if (rows, columns) == (side, side):
@@ -69,7 +69,7 @@ class SelfAttention(nn.Module):
         self.out_proj = nn.Linear(sizes.width, sizes.width)
 
     def forward(self, x: Tensor) -> Tensor:
-        """`(V, P, vision_width)` to the same shape."""
+        """``(V, P, vision_width)`` to the same shape."""
         projections = (self.q_proj, self.k_proj, self.v_proj)
         q, k, v = (
             split_heads(project(x), self.head_dim) for project in projections
@@ -86,7 +86,7 @@ class Mlp(nn.Module):
         self.fc2 = nn.Linear(sizes.mlp_width, sizes.width)
 
     def forward(self, x: Tensor) -> Tensor:
-        """`(..., vision_width)` to the same shape."""
+        """``(..., vision_width)`` to the same shape."""
         return self.fc2(F.gelu(self.fc1(x), approximate="tanh"))
 
 
@@ -101,7 +101,7 @@ class EncoderLayer(nn.Module):
         self.mlp = Mlp(sizes)
 
     def forward(self, x: Tensor) -> Tensor:
-        """`(V, P, vision_width)` to the same shape."""
+        """``(V, P, vision_width)`` to the same shape."""
         x = x + self.self_attn(self.layer_norm1(x))
         return x + self.mlp(self.layer_norm2(x))
 
@@ -114,7 +114,7 @@ class Encoder(nn.Module):
         self.layers = nn.ModuleList(EncoderLayer(sizes) for _ in range(sizes.num_layers))
 
     def forward(self, x: Tensor) -> Tensor:
-        """`(V, P, vision_width)` to the same shape."""
+        """``(V, P, vision_width)`` to the same shape."""
         for layer in self.layers:
             x = layer(x)
         return x
@@ -130,7 +130,7 @@ class VisionTransformer(nn.Module):
         self.post_layernorm = nn.LayerNorm(sizes.width, eps=sizes.eps)
 
     def forward(self, pixels: Tensor) -> Tensor:
-        """`(V, 3, height, width)` to `(V, P, vision_width)`."""
+        """``(V, 3, height, width)`` to ``(V, P, vision_width)``."""
         return self.post_layernorm(self.encoder(self.embeddings(pixels)))
 
 
@@ -142,21 +142,21 @@ class VisionModel(nn.Module):
         self.vision_model = VisionTransformer(sizes, embeddings)
 
     def forward(self, pixels: Tensor) -> Tensor:
-        """`(V, 3, height, width)` to `(V, P, vision_width)`."""
+        """``(V, 3, height, width)`` to ``(V, P, vision_width)``."""
         return self.vision_model(pixels)
 
 
 def join_squares(x: Tensor, rows: int, columns: int, side: int, *, channels_first: bool) -> Tensor:
-    """Joins the patches of each `side` x `side` square into one token.
+    """Joins the patches of each ``side`` x ``side`` square into one token.
 
     Args:
-        x: `(V, rows * columns, vision_width)`.
-        rows, columns: the grid of patches; `side` divides both.
-        side: patches along a side of a square.
+        x: ``(V, rows * columns, vision_width)``.
+        rows, columns: The grid of patches; ``side`` divides both.
+        side: Patches along a side of a square.
         channels_first: N1.6's order of the features, (channel, y, x). Otherwise N1.5's, (y, x, channel).
 
     Returns:
-        `(V, rows * columns / side**2, vision_width * side**2)`.
+        ``(V, rows * columns / side**2, vision_width * side**2)``.
     """
     if side == 1:
         return x
@@ -166,7 +166,7 @@ def join_squares(x: Tensor, rows: int, columns: int, side: int, *, channels_firs
 
 
 def connector(inputs: int, width: int, num_layers: int) -> nn.Sequential:
-    """`mlp1`: from the vision tower's width to the language model's."""
+    """``mlp1``: from the vision tower's width to the language model's."""
     if num_layers == 1:
         return nn.Sequential(nn.Linear(inputs, width))
     # nn.GELU is the exact one, by erf, unlike the tower's.

@@ -1,4 +1,4 @@
-"""`saccade study cuts`: parts of the head cut or replaced, on equal episodes and noise."""
+"""``saccade study cuts``: parts of the head cut or replaced, on equal episodes and noise."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ examples:
 
 
 def cut(*pairs: tuple[str, str]) -> Callable[[Float32Array, np.random.Generator], Intervention]:
-    """An intervention of an arm: `(reader, source)` pairs cut in every block."""
+    """An intervention of an arm: ``(reader, source)`` pairs cut in every block."""
     return lambda tokens, rng: Intervention(cut=pairs)
 
 
@@ -148,7 +148,7 @@ class Cuts(ArmStudy):
     """What the actions and success lose when parts of the head are cut or replaced.
 
     Attributes:
-        source, arms, metrics: See `ArmStudy`; arms default to all of `ARMS`.
+        source, arms, metrics: See ``ArmStudy``; arms default to all of ``ARMS``.
     """
 
     arms: Sequence[Arm] = ALL_ARMS
@@ -158,7 +158,7 @@ class Cuts(ArmStudy):
 
     @classmethod
     def add_arguments(cls, parser: argparse.ArgumentParser) -> None:
-        """See `Study`."""
+        """See ``Study``."""
         width = max(len(name) for name in ARMS)
         parser.epilog = EPILOG.format(
             arms="\n".join(f"  {arm.name:{width}}  {arm.label}" for arm in ARMS.values())
@@ -172,19 +172,19 @@ class Cuts(ArmStudy):
 
     @classmethod
     def from_arguments(cls, args: argparse.Namespace) -> Cuts:
-        """See `Study`."""
+        """See ``Study``."""
         chosen = tuple(args.arms or ARMS)
         check_known("--arms", chosen, ARMS)
         return cls(source_of(args, "engine"), tuple(ARMS[name] for name in chosen))
 
     def settings(self) -> Mapping[str, Any]:
-        """See `Study`."""
+        """See ``Study``."""
         engine = {"engine": self.source.engine_name} if self.source.closed_loop else {}
         return {**super().settings(), **engine}
 
     @classmethod
     def summarise(cls, table: pd.DataFrame, provenance: Provenance) -> Section:
-        """See `Study`."""
+        """See ``Study``."""
         if not is_recorded(provenance):
             return section(arms_in(table), table, provenance)
         arms = arms_in(table)
@@ -193,7 +193,7 @@ class Cuts(ArmStudy):
 
 
 def arms_in(table: pd.DataFrame) -> dict[str, Arm]:
-    """The arms of a table: those of `ARMS` in their order, then other arms by their names."""
+    """The arms of a table: those of ``ARMS`` in their order, then other arms by their names."""
     named = dict.fromkeys(str(name) for name in table["arm"])
     known = {name: arm for name, arm in ARMS.items() if name in named}
     return known | {name: Arm(name) for name in named if name not in ARMS}

@@ -40,7 +40,7 @@ class ArmResult:
         pairs: The comparison with the unchanged policy.
         change: Mean |change| of an action.
         note: Why it was not measured.
-        corrected_p: p value of McNemar's test, corrected by Holm for all arms except the control.
+        corrected_p: P value of McNemar's test, corrected by Holm for all arms except the control.
     """
 
     name: str

@@ -1,4 +1,4 @@
-"""`saccade study fast`: what faster modes of the head cost in actions and in success, and what they save."""
+"""``saccade study fast``: what faster modes of the head cost in actions and success, and what they save."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ class Fast(Study):
 
     Attributes:
         source: Checkpoint and observations.
-        parts: Names from `PARTS`. `episodes` is skipped without a closed loop.
+        parts: Names from ``PARTS``. ``episodes`` is skipped without a closed loop.
         modes: Names of modes. Default: those of each part.
         calibration: What calibrated modes depend on; None until it has been measured.
     """
@@ -102,7 +102,7 @@ class Fast(Study):
 
     @classmethod
     def add_arguments(cls, parser: argparse.ArgumentParser) -> None:
-        """See `Study`."""
+        """See ``Study``."""
         parser.epilog = EPILOG
         add_rollout_arguments(parser, episodes=300)
         add_list(parser, "--modes", help="modes (default: a list for each part)")
@@ -112,7 +112,7 @@ class Fast(Study):
 
     @classmethod
     def from_arguments(cls, args: argparse.Namespace) -> Fast:
-        """See `Study`."""
+        """See ``Study``."""
         parts = PARTS if args.parts is None else args.parts
         check_known("--parts", parts, PARTS)
         modes = None
@@ -123,7 +123,7 @@ class Fast(Study):
         return cls(source_of(args), tuple(parts), modes)
 
     def settings(self) -> Mapping[str, Any]:
-        """See `Study`."""
+        """See ``Study``."""
         return self.source.describe()
 
     @property
@@ -157,7 +157,7 @@ class Fast(Study):
         return self.calibration is None and bool(self.calibration_cells())
 
     def cells(self) -> Sequence[Cell]:
-        """See `Study`."""
+        """See ``Study``."""
         first = self.calibration_cells()
         if self.calibrating:
             return first
@@ -177,15 +177,15 @@ class Fast(Study):
 
     @property
     def num_cells(self) -> int:
-        """See `Study`."""
+        """See ``Study``."""
         return len(self.cells()) + self.calibrating
 
     def then(self, table: pd.DataFrame) -> Fast | None:
-        """See `Study`: after the calibration, everything else."""
+        """See ``Study``: after the calibration, everything else."""
         return replace(self, calibration=calibration_of(table)) if self.calibrating else None
 
     def measure(self, cell: Cell) -> Rows:
-        """See `Study`."""
+        """See ``Study``."""
         part, task, seed, name = str(cell.key[0]), str(cell.key[1]), int(cell.key[2]), str(cell.key[3])
         if part == CALIBRATE:
             values = self.mass() if task == "mass" else self.step_times(seed)
@@ -275,7 +275,7 @@ class Fast(Study):
 
     @classmethod
     def summarise(cls, table: pd.DataFrame, provenance: Provenance) -> Section:
-        """See `Study`."""
+        """See ``Study``."""
         return section(table, provenance)
 
 
@@ -321,7 +321,7 @@ class Reference:
 
     Attributes:
         observation: Input of the head.
-        chunk: Chunk of the baseline, comparable actions `(1, horizon, action_dim)`.
+        chunk: Chunk of the baseline, comparable actions ``(1, horizon, action_dim)``.
         exact: Chunk of many steps.
         other: Chunk of the baseline from other noise; None if the recording has only one noise.
     """

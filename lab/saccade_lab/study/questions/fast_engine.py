@@ -19,7 +19,7 @@ from saccade_lab.study.wrapped_head import WrappedHead
 
 
 class ModeHead(WrappedHead):
-    """A policy's head in one of the modes, on one thread; a `saccade.policy.head.Head`.
+    """A policy's head in one of the modes, on one thread; a ``saccade.policy.head.Head``.
 
     Args:
         checkpoint: Directory of the policy.
@@ -34,7 +34,7 @@ class ModeHead(WrappedHead):
         self._calibration = calibration
 
     def encode(self, backbone_features: ArrayLike, *, drop_vl: Any = None, **masks: Any) -> Context:
-        """See `Head`. The other masks change nothing in N1.5, and are not read."""
+        """See ``Head``. The other masks change nothing in N1.5, and are not read."""
         if drop_vl is not None:
             raise InputError("drop_vl: given a mask, expected None: a mode runs one observation at a time")
         features = np.asarray(backbone_features)
@@ -43,7 +43,7 @@ class ModeHead(WrappedHead):
         )
 
     def sample(self, context: Context, state: ArrayLike, embodiment_id: Any, **options: Any) -> Float32Array:
-        """See `Head`; takes noise and no intervention."""
+        """See ``Head``; takes noise and no intervention."""
         if options.get("intervention") is not None:
             raise InputError("intervention: given one, expected None with a faster mode")
         observation = given(np.empty((1, 0, 0), np.float32), np.asarray(state), options["noise"])

@@ -19,7 +19,7 @@ from saccade.head.inputs import HeadInputs
 from saccade_lab.study.cell import digest
 
 BoolArray = npt.NDArray[np.bool_]
-#: Noisy actions `(1, horizon, encoder_action_dim)` and a time in 0..1 -> `(1, horizon, action_dim)`.
+#: Noisy actions ``(1, horizon, encoder_action_dim)`` and a time in 0..1 -> ``(1, horizon, action_dim)``.
 Velocity = Callable[[Float32Array, float], npt.NDArray[np.floating[Any]]]
 
 PRECISIONS = ("float32", "bfloat16", "int8")
@@ -36,11 +36,11 @@ class Mode:
 
     Attributes:
         precision: Precision of the head.
-        integrator: One of `INTEGRATORS`. `midpoint` and `heun` evaluate the velocity twice per step. `adams`
-            (Adams-Bashforth, second order) evaluates it once and extrapolates from the previous value.
-            `times` is Euler at step times that are optimised for the checkpoint.
+        integrator: One of ``INTEGRATORS``. ``midpoint`` and ``heun`` evaluate the velocity twice per step.
+            ``adams`` (Adams-Bashforth, second order) evaluates it once and extrapolates from the previous
+            value. ``times`` is Euler at step times that are optimised for the checkpoint.
         num_steps: Number of steps of the integrator.
-        refresh: State and future rows are recomputed every `refresh` evaluations; 1 is exact.
+        refresh: State and future rows are recomputed every ``refresh`` evaluations; 1 is exact.
         drop: Percentage of the vision-language tokens that are removed, those with the least attention.
 
     Example:
@@ -125,11 +125,11 @@ class Calibration:
     mass: tuple[float, ...] = ()
 
     def grid(self, num_steps: int) -> tuple[float, ...]:
-        """The times of `num_steps` steps."""
+        """The times of ``num_steps`` steps."""
         return next(grid for grid in self.times if len(grid) == num_steps + 1)
 
     def least(self, percent: int, removed: BoolArray) -> BoolArray:
-        """Which positions are removed: `percent` of those not `removed` yet, rounded down, `(1, T_vl)` each.
+        """Removed positions, ``(1, T_vl)`` each: ``percent`` of those not ``removed`` yet, rounded down.
 
         Positions that no calibrated observation had, those of longer instructions, go last.
         """
@@ -160,7 +160,7 @@ def encode(head: ActionHead, mode: Mode, calibration: Calibration, observation: 
 def sample(
     head: ActionHead, mode: Mode, calibration: Calibration, context: Context, observation: HeadInputs
 ) -> Float32Array:
-    """A chunk `(1, horizon, action_dim)` as the mode computes it, from the observation's noise."""
+    """A chunk ``(1, horizon, action_dim)`` as the mode computes it, from the observation's noise."""
     if mode.integrator in OF_THE_HEAD:
         return observation.sample(
             head,
@@ -176,7 +176,7 @@ def sample(
 
 
 def many_steps(head: ActionHead, context: Context, observation: HeadInputs) -> Float32Array:
-    """The chunk for many small steps, `(1, horizon, action_dim)`."""
+    """The chunk for many small steps, ``(1, horizon, action_dim)``."""
     return observation.sample(head, context, num_steps=EXACT_STEPS, integrator="midpoint")
 
 
@@ -203,13 +203,13 @@ def integrate(
     """Integrates a velocity from noise at time 0 to actions at time 1.
 
     Args:
-        velocity: Velocity of the first `action_dim` numbers. The others are not changed.
-        start: `(batch, horizon, encoder_action_dim)`.
-        integrator: One of `INTEGRATORS`, except `midpoint`.
-        times: Step times from 0 to 1. `adams` needs steps of equal length.
+        velocity: Velocity of the first ``action_dim`` numbers. The others are not changed.
+        start: ``(batch, horizon, encoder_action_dim)``.
+        integrator: One of ``INTEGRATORS``, except ``midpoint``.
+        times: Step times from 0 to 1. ``adams`` needs steps of equal length.
 
     Returns:
-        An array of the shape of `start`.
+        An array of the shape of ``start``.
 
     Example:
         A velocity that grows with time, for which Heun's rule is exact:
@@ -236,7 +236,7 @@ def integrate(
 
 
 def moved(x: Float32Array, slope: npt.NDArray[np.floating[Any]], length: float) -> Float32Array:
-    """`x` after a step of that length along `slope`."""
+    """``x`` after a step of that length along ``slope``."""
     further = x.copy()
     further[..., : slope.shape[-1]] += np.float32(length) * slope
     return further
@@ -267,7 +267,7 @@ def best_times(error: Callable[[tuple[float, ...]], float], num_steps: int) -> t
 
 
 def cross_mass(head: ActionHead, context: Context, observation: HeadInputs) -> Float32Array:
-    """The share of the cross-attention of each vision-language position, `(T_vl,)`.
+    """The share of the cross-attention of each vision-language position, ``(T_vl,)``.
 
     The mean over rows, heads, blocks and four Euler steps.
     """

@@ -43,13 +43,13 @@ class ModeResult:
     Attributes:
         name: Name of the mode.
         change: Mean |difference| of an action from the baseline's.
-        ratio: `change` divided by the difference that another noise makes.
+        ratio: ``change`` divided by the difference that another noise makes.
         error: Mean |difference| of an action from many small steps.
         successes, episodes: On the tasks that count.
         pairs: The comparison with the baseline on these tasks.
-        p_loss: p value of a loss of `LOSS_THAT_MATTERS`, corrected by Holm; None for modes without a verdict.
-        p_value: p value of McNemar's test, corrected by Holm; None for modes without a verdict.
-        times: Times by size.
+        p_loss: P value of a loss of ``LOSS_THAT_MATTERS``, corrected by Holm; None for modes without a
+            verdict. p_value: P value of McNemar's test, corrected by Holm; None for modes without a verdict.
+            times: Times by size.
     """
 
     name: str
@@ -80,7 +80,7 @@ class ModeResult:
 
     @property
     def excludes_loss(self) -> bool:
-        """Whether a loss of `LOSS_THAT_MATTERS` is excluded after Holm's correction."""
+        """Whether a loss of ``LOSS_THAT_MATTERS`` is excluded after Holm's correction."""
         return self.p_loss is not None and self.p_loss < (1 - CONFIDENCE) / 2
 
     @property

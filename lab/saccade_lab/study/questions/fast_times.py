@@ -45,7 +45,7 @@ def times_of(
     calibration: Calibration,
     observation: HeadInputs,
 ) -> Rows:
-    """Milliseconds of `encode` and `sample` in each mode, in rounds with a random order of modes.
+    """Milliseconds of ``encode`` and ``sample`` in each mode, in rounds with a random order of modes.
 
     Args:
         modes: Modes to time.

@@ -1,6 +1,6 @@
-"""`saccade study gradients`: the derivatives of the actions, and how much of them runs through future tokens.
+"""``saccade study gradients``: derivatives of the actions, and how much runs through future tokens.
 
-Backward passes through `saccade_lab.reference`, on the observations of episodes in closed loop or of a
+Backward passes through ``saccade_lab.reference``, on the observations of episodes in closed loop or of a
 file. Two
 questions: how much the actions (and the loss on demonstrations) would change if a row changed by its own
 length, and along which paths the derivative of the actions by the vision-language tokens arises.
@@ -69,7 +69,7 @@ class Gradients(Study):
         source: Checkpoint and observations.
         projections: Random projections of the actions, or draws of time and noise for the loss.
         num_observations: Observations taken from each episode, evenly spaced; a file has one in each row.
-        demonstrations: Directory of `saccade demos` for the loss, or None: it is then not measured.
+        demonstrations: Directory of ``saccade demos`` for the loss, or None: it is then not measured.
     """
 
     source: Source
@@ -80,7 +80,7 @@ class Gradients(Study):
 
     @classmethod
     def add_arguments(cls, parser: argparse.ArgumentParser) -> None:
-        """See `Study`."""
+        """See ``Study``."""
         parser.epilog = EPILOG
         add_rollout_arguments(parser, episodes=10)
         add_frames(parser)
@@ -104,7 +104,7 @@ class Gradients(Study):
 
     @classmethod
     def from_arguments(cls, args: argparse.Namespace) -> Gradients:
-        """See `Study`."""
+        """See ``Study``."""
         source = source_of(args, "num_observations", "demos")
         if not source.closed_loop:
             return cls(source, args.projections)
@@ -123,7 +123,7 @@ class Gradients(Study):
         return self.source
 
     def settings(self) -> Mapping[str, Any]:
-        """See `Study`."""
+        """See ``Study``."""
         # The key that tables have had from the start.
         observed = {"looks": self.num_observations} if self.source.closed_loop else {}
         return {**self.source.describe(), **observed, "projections": self.projections}
@@ -145,7 +145,7 @@ class Gradients(Study):
 
     @property
     def files(self) -> tuple[str | Path, ...]:
-        """See `Study`."""
+        """See ``Study``."""
         return (*super().files, *(() if self.demonstrations is None else (self.demonstrations,)))
 
     def measure(self, cell: Cell) -> Rows:
@@ -182,7 +182,7 @@ class Gradients(Study):
         Args:
             source: The source.
             row: Which observation.
-            by_vl: Derivatives by the vision-language tokens, `(projections, T_vl, context_dim)`.
+            by_vl: Derivatives by the vision-language tokens, ``(projections, T_vl, context_dim)``.
         """
         import torch
 
@@ -278,7 +278,7 @@ class Gradients(Study):
 
     @classmethod
     def summarise(cls, table: pd.DataFrame, provenance: Provenance) -> Section:
-        """See `Study`."""
+        """See ``Study``."""
         return section(table, provenance)
 
 
@@ -286,7 +286,7 @@ def check_demonstrations(directory: Path, source: Simulator) -> None:
     """Checks that there are demonstrations with the same cameras and image size as the policy.
 
     Raises:
-        InputError: there are none for a task, or the pictures differ.
+        InputError: There are none for a task, or the pictures differ.
     """
     from saccade_lab.sim import demos
 
@@ -331,8 +331,8 @@ def sensitivity_rows(measured: Sequence[Sensitivity], rows: Mapping[str, slice])
     """The mean over several observations, by block and group, and for learned tokens one by one.
 
     Args:
-        measured: the results of `action_sensitivity` or `loss_sensitivity`, one for each observation.
-        rows: the slice of each group.
+        measured: The results of ``action_sensitivity`` or ``loss_sensitivity``, one for each observation.
+        rows: The slice of each group.
     """
     import torch
 
@@ -366,7 +366,7 @@ def path_rows(measured: Sequence[Shares]) -> Rows:
 
 
 def spaced(count: int, wanted: int) -> list[int]:
-    """At most `wanted` of `count` places, evenly spaced, the first among them.
+    """At most ``wanted`` of ``count`` places, evenly spaced, the first among them.
 
     Example:
         >>> spaced(9, 3), spaced(2, 3)

@@ -117,7 +117,7 @@ def parts_of(table: pd.DataFrame) -> dict[tuple[str, str], pd.DataFrame]:
 
 
 def input_shares(table: pd.DataFrame) -> dict[str, dict[str, Estimate]]:
-    """The share of each part, by kind of input: `tokens` and `pixels`."""
+    """The share of each part, by kind of input: ``tokens`` and ``pixels``."""
     found: dict[str, dict[str, Estimate]] = {}
     for (kind, part), rows in parts_of(table).items():
         found.setdefault(kind, {})[part] = mean_of(rows, "share")

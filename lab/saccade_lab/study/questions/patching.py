@@ -1,4 +1,4 @@
-"""`saccade study patching`: rows of one observation inserted into the run of another."""
+"""``saccade study patching``: rows of one observation inserted into the run of another."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ class Patching(Study):
         source: The receivers: the first observation of each episode, or each row of a file.
         blocks: Are patched one by one, and all of them at once.
         steps: Euler steps in which they are patched.
-        kinds: Kinds of donors, names from `KINDS`; of recorded observations the one of `kind_of`. In the
+        kinds: Kinds of donors, names from ``KINDS``; of recorded observations the one of ``kind_of``. In the
             simulator, donors have the seeds that follow those of the receivers.
     """
 
@@ -83,7 +83,7 @@ class Patching(Study):
 
     @classmethod
     def add_arguments(cls, parser: argparse.ArgumentParser) -> None:
-        """See `Study`."""
+        """See ``Study``."""
         width = max(len(name) for name in KINDS)
         parser.epilog = EPILOG.format(
             kinds="\n".join(f"  {name:{width}}  {about}" for name, about in KINDS.items())
@@ -105,7 +105,7 @@ class Patching(Study):
 
     @classmethod
     def from_arguments(cls, args: argparse.Namespace) -> Patching:
-        """See `Study`."""
+        """See ``Study``."""
         kinds = tuple(args.kinds or KINDS)
         check_known("--kinds", kinds, KINDS)
         source = source_of(args, "kinds")
@@ -122,7 +122,7 @@ class Patching(Study):
         )
 
     def settings(self) -> Mapping[str, Any]:
-        """See `Study`."""
+        """See ``Study``."""
         return {**self.source.describe(), "blocks": self.blocks, "steps": self.steps}
 
     def cells(self) -> Sequence[Cell]:
@@ -146,7 +146,7 @@ class Patching(Study):
 
     @classmethod
     def summarise(cls, table: pd.DataFrame, provenance: Provenance) -> Section:
-        """See `Study`."""
+        """See ``Study``."""
         return section(table, provenance)
 
 
@@ -226,18 +226,18 @@ def patched(
     """A row for each group of rows and block: what the donor's rows do in the receiver's run.
 
     Args:
-        head: head that computes.
-        pair: donor and receiver.
-        blocks: after which rows are patched, one by one and all at once.
+        head: Head that computes.
+        pair: Donor and receiver.
+        blocks: After which rows are patched, one by one and all at once.
         steps: Euler steps in which they are patched.
-        row: columns that all rows have.
-        action_width: number of action dimensions that count.
+        row: Columns that all rows have.
+        action_width: Number of action dimensions that count.
     """
     receiver = pair.receiver
     context = receiver.encode(head)
 
     def chunk(intervention: Intervention | None) -> npt.NDArray[np.float64]:
-        """The head's own, normalised actions, `(horizon, action_width)`."""
+        """The head's own, normalised actions, ``(horizon, action_width)``."""
         found = receiver.sample(head, context, intervention=intervention)[0, :, :action_width]
         return np.asarray(found, dtype=np.float64)
 

@@ -1,4 +1,4 @@
-"""`saccade study probes`: what linear probes read from the head's rows, block by block.
+"""``saccade study probes``: what linear probes read from the head's rows, block by block.
 
 Episodes of the policy in closed loop are traced. From the rows after each block, ridge regressions are fitted
 to what the simulator knows (positions of object, goal and hand, opening of the gripper), judged on episodes
@@ -66,7 +66,7 @@ class Probes(Study):
         step: The Euler step at which rows are taken. At step 0 the action rows start from noise, so all
             information that is found in them was read from other rows or tokens.
         dimensions: Principal components that a probe reads at most.
-        frames: Directory of the traced episodes, which `begin` sets.
+        frames: Directory of the traced episodes, which ``begin`` sets.
         recorded: Whether all episodes are recorded, so that probes can be fitted.
     """
 
@@ -79,7 +79,7 @@ class Probes(Study):
 
     @classmethod
     def add_arguments(cls, parser: argparse.ArgumentParser) -> None:
-        """See `Study`."""
+        """See ``Study``."""
         parser.epilog = EPILOG
         add_rollout_arguments(parser, episodes=20)
         add_integer(parser, "--step", minimum=0, default=0, help="Euler step at which rows are taken")
@@ -87,7 +87,7 @@ class Probes(Study):
 
     @classmethod
     def from_arguments(cls, args: argparse.Namespace) -> Probes:
-        """See `Study`."""
+        """See ``Study``."""
         source = simulator_of(args)
         if len(source.seeds) < FOLDS:
             raise InputError(
@@ -98,11 +98,11 @@ class Probes(Study):
         return cls(source, args.step, args.dimensions)
 
     def begin(self, out: Path) -> Probes:
-        """See `Study`."""
+        """See ``Study``."""
         return replace(self, frames=out / self.name / f"frames-{digest(self.settings())}")
 
     def settings(self) -> Mapping[str, Any]:
-        """See `Study`."""
+        """See ``Study``."""
         return {**self.source.describe(), "step": self.step}
 
     @property
@@ -115,7 +115,7 @@ class Probes(Study):
 
     @property
     def num_cells(self) -> int:
-        """See `Study`."""
+        """See ``Study``."""
         return len(self.source.units) + len(self.scopes)
 
     def cells(self) -> Sequence[Cell]:
@@ -130,7 +130,7 @@ class Probes(Study):
         ]
 
     def then(self, table: pd.DataFrame) -> Probes | None:
-        """See `Study`."""
+        """See ``Study``."""
         return None if self.recorded else replace(self, recorded=True)
 
     def measure(self, cell: Cell) -> Rows:
@@ -170,7 +170,7 @@ class Probes(Study):
 
     @classmethod
     def summarise(cls, table: pd.DataFrame, provenance: Provenance) -> Section:
-        """See `Study`."""
+        """See ``Study``."""
         return section(table, provenance)
 
 
@@ -178,9 +178,9 @@ def frames_of(head: ActionHead, recorded: Recorded, step: int) -> Frames:
     """The observations of one episode, traced at one Euler step.
 
     Args:
-        head: head of the policy.
-        recorded: the episode.
-        step: the Euler step at which rows are taken.
+        head: Head of the policy.
+        recorded: The episode.
+        step: The Euler step at which rows are taken.
     """
     parts: dict[Input, list[FloatArray]] = {}
 

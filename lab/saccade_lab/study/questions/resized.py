@@ -1,4 +1,4 @@
-"""`saccade study n-runtime`: a policy's number of future tokens changed at run time, without training.
+"""``saccade study n-runtime``: a policy's number of future tokens changed at run time, without training.
 
 Some of the learned tokens, tokens merged with those like them, tokens repeated: in closed loop on equal
 episodes, with and without the weight in the softmax that the learned number of tokens would have.
@@ -46,7 +46,7 @@ class Resized(ArmStudy):
     """What actions and success lose with another number of future tokens at run time.
 
     Attributes:
-        source, arms, metrics: See `ArmStudy`; `arms_of` makes the arms.
+        source, arms, metrics: See ``ArmStudy``; ``arms_of`` makes the arms.
     """
 
     name: ClassVar[str] = "n-runtime"
@@ -55,7 +55,7 @@ class Resized(ArmStudy):
 
     @classmethod
     def add_arguments(cls, parser: argparse.ArgumentParser) -> None:
-        """See `Study`."""
+        """See ``Study``."""
         parser.epilog = EPILOG
         add_rollout_arguments(parser, episodes=15)
         add_frames(parser)
@@ -70,19 +70,19 @@ class Resized(ArmStudy):
 
     @classmethod
     def from_arguments(cls, args: argparse.Namespace) -> Resized:
-        """See `Study`."""
+        """See ``Study``."""
         source = source_of(args)
         return cls(source, arms_of(sizes_of(args.num_future_tokens, source.config.num_future_tokens)))
 
     def cells(self) -> Sequence[Cell]:
-        """See `ArmStudy`. A policy without tokens is not run: one cell for each episode says so."""
+        """See ``ArmStudy``. A policy without tokens is not run: one cell for each episode says so."""
         if self.source.closed_loop and not self.source.config.num_future_tokens:
             return [Cell((*unit, TWICE)) for unit in self.source.units]
         return super().cells()
 
     @classmethod
     def summarise(cls, table: pd.DataFrame, provenance: Provenance) -> Section:
-        """See `Study`."""
+        """See ``Study``."""
         if not is_recorded(provenance):
             return section(table, provenance)
         labels = {arm: arm for arm in sorted(dict.fromkeys(table["arm"]), key=arm_order)}
@@ -90,10 +90,10 @@ class Resized(ArmStudy):
 
 
 def sizes_of(given: Sequence[int] | None, count: int) -> tuple[int, ...]:
-    """The numbers of tokens to go down to from `count`, in increasing order; none if there are no tokens.
+    """The numbers of tokens to go down to from ``count``, in increasing order; none if there are no tokens.
 
     Raises:
-        InputError: one of those given is not below `count`.
+        InputError: One of those given is not below ``count``.
     """
     if count == 0:
         return ()
@@ -117,7 +117,7 @@ def arms_of(sizes: Sequence[int]) -> tuple[Arm, ...]:
 
 
 def drawn(size: int, *, equal_mass: bool = False) -> Arm:
-    """`size` of the tokens, others in every episode; with `equal_mass` their keys weigh as much as all."""
+    """Tokens ``(N, width)`` merged to ``size``, with a bias on their keys that keeps the softmax's mass."""
 
     def intervention(tokens: Float32Array, rng: np.random.Generator) -> Intervention:
         chosen = tokens[np.sort(rng.choice(len(tokens), size, replace=False))]
@@ -127,7 +127,7 @@ def drawn(size: int, *, equal_mass: bool = False) -> Arm:
 
 
 def merged(size: int) -> Arm:
-    """Tokens merged to `size` as `saccade resize` does it."""
+    """Tokens merged to ``size`` as ``saccade resize`` does it."""
     return Arm(
         f"{size} merged",
         intervention=lambda tokens, rng: merge(tokens, size),
@@ -136,7 +136,7 @@ def merged(size: int) -> Arm:
 
 
 def merge(tokens: Float32Array, size: int) -> Intervention:
-    """Tokens `(N, width)` merged to `size`, with a bias on their keys that keeps the mass in the softmax."""
+    """``size`` tokens, others in every episode; with ``equal_mass`` their keys weigh as much as all."""
     rows, _, key_bias = _saccade.merge_future_tokens(tokens, size)
     return with_bias(rows, None if key_bias is None else np.array(key_bias, np.float32))
 

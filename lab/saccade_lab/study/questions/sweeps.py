@@ -1,4 +1,4 @@
-"""`saccade study n | tvl | vlsa`: trained policies that differ in one respect.
+"""``saccade study n | tvl | vlsa``: trained policies that differ in one respect.
 
 Each sweep trains policies, or reads trained ones, in which the number of future tokens (with or without the
 alignment loss), the number of vision-language tokens, or the depth of the VL self-attention varies and
@@ -62,7 +62,7 @@ class Sweep(Study):
         runs: Directory of each run, by name.
         planned: The runs that are trained, by name.
         tasks, seeds: The episodes of every policy: each seed in each task.
-        stage: `TRAINING`, `EPISODES` or `COST`.
+        stage: ``TRAINING``, ``EPISODES`` or ``COST``.
         varied: The settings that define a point of the sweep.
         setting: The training setting whose values are given on the command line.
         values: Its default values.
@@ -86,7 +86,7 @@ class Sweep(Study):
 
     @classmethod
     def add_arguments(cls, parser: argparse.ArgumentParser) -> None:
-        """See `Study`."""
+        """See ``Study``."""
         values = ",".join(map(str, cls.values))
         parser.epilog = EPILOG.format(study=cls.name, flag=cls.flag(), values=values)
         for flag, text in (
@@ -135,7 +135,7 @@ class Sweep(Study):
 
     @classmethod
     def from_arguments(cls, args: argparse.Namespace) -> Sweep:
-        """See `Study`."""
+        """See ``Study``."""
         from saccade_lab.sim import demos, graphics
         from saccade_lab.sim.settings import CONFIG_FILE, SimulationConfig
         from saccade_lab.sim.tasks import check_evaluation_seeds
@@ -229,7 +229,7 @@ class Sweep(Study):
             )
 
     def begin(self, out: Path) -> Sweep:
-        """See `Study`; says what can be detected."""
+        """See ``Study``; says what can be detected."""
         directories = {name: out / "policies" / name for name in self.planned}
         found = replace(self, runs={**self.runs, **directories})
         print("Detectable with 80 % power at the 5 % level:", file=sys.stderr)
@@ -238,7 +238,7 @@ class Sweep(Study):
         return found
 
     def settings(self) -> Mapping[str, Any]:
-        """See `Study`."""
+        """See ``Study``."""
         # A directory contains policies that may be compared. Only aligned runs have an alignment block.
         training: dict[str, Any] = {"alignment_block": None}
         for name in self.runs:
@@ -262,7 +262,7 @@ class Sweep(Study):
         return {"runs": min(map(points.count, points)), "episodes": episodes}
 
     def cells(self) -> Sequence[Cell]:
-        """See `Study`."""
+        """See ``Study``."""
         cells = [Cell(("before",), self.before)]
         for name in self.runs:
             planned = self.planned.get(name)
@@ -294,12 +294,12 @@ class Sweep(Study):
 
     @property
     def num_cells(self) -> int:
-        """See `Study`; without the control of equal mass until the policies are trained."""
+        """See ``Study``; without the control of equal mass until the policies are trained."""
         missing = len(self.runs) if self.stage == TRAINING else len(self.runs) - len(self.finished())
         return len(self.cells()) + missing * len(self.tasks) * len(self.seeds) + (self.stage < COST)
 
     def then(self, table: pd.DataFrame) -> Sweep | None:
-        """See `Study`: after the training the episodes, then, alone, the cost."""
+        """See ``Study``: after the training the episodes, then, alone, the cost."""
         if self.stage == TRAINING:
             self.check_comparable([self.read(name) for name in self.runs])
         if self.stage == COST or (self.stage == EPISODES and not self.finished()):
@@ -307,7 +307,7 @@ class Sweep(Study):
         return replace(self, stage=self.stage + 1)
 
     def measure(self, cell: Cell) -> Rows:
-        """See `Study`; the first word of the key says what is measured."""
+        """See ``Study``; the first word of the key says what is measured."""
         kind = str(cell.key[0])
         if kind == "before":
             rows = detectable(int(cell.settings["runs"]), int(cell.settings["episodes"]))
@@ -321,7 +321,7 @@ class Sweep(Study):
 
     @property
     def files(self) -> tuple[str | Path, ...]:
-        """See `Study`: finished runs, and demonstrations. Runs that are trained stay in the output
+        """See ``Study``: finished runs, and demonstrations. Runs that are trained stay in the output
         directory, which other machines must share.
         """
         finished = (path for name, path in self.runs.items() if name not in self.planned)
@@ -346,7 +346,7 @@ class Sweep(Study):
         return {**describe_run(run), "validation_loss": loss, "steps": run.step, "note": note}
 
     def episode(self, cell: Cell) -> dict[str, Any]:
-        """One episode of one policy; an arm other than `PLAIN` weights the future keys like another N."""
+        """One episode of one policy; an arm other than ``PLAIN`` weights the future keys like another N."""
         from saccade_lab.study.simulator import judge
 
         _, name, arm, task, seed = cell.key
@@ -358,12 +358,12 @@ class Sweep(Study):
 
     @classmethod
     def summarise(cls, table: pd.DataFrame, provenance: Provenance) -> Section:
-        """See `Study`."""
+        """See ``Study``."""
         return section(cls.name, cls.varied, table)
 
 
 def weight(word: str) -> float:
-    """A weight on the command line; raises `ValueError` if it is not a finite number."""
+    """A weight on the command line; raises ``ValueError`` if it is not a finite number."""
     value = float(word)
     if not math.isfinite(value):
         raise ValueError(word)
@@ -371,7 +371,7 @@ def weight(word: str) -> float:
 
 
 def equal_mass(num_tokens: int, like: int) -> Intervention:
-    """Gives `num_tokens` future keys the total weight in the softmax that `like` keys would have.
+    """Gives ``num_tokens`` future keys the total weight in the softmax that ``like`` keys would have.
 
     Example:
         >>> round(float(equal_mass(8, 32).key_bias["future", None]), 4)  # log(32 / 8)
@@ -381,7 +381,7 @@ def equal_mass(num_tokens: int, like: int) -> Intervention:
 
 
 def detectable(runs: int, episodes: int) -> Rows:
-    """What can be detected with `runs` runs per point and `episodes` per run, under several assumptions."""
+    """What ``runs`` runs per point and ``episodes`` per run can detect, under several assumptions."""
     rows: Rows = [
         {
             "comparison": "two trained policies on the same episodes",
@@ -403,19 +403,19 @@ def detectable(runs: int, episodes: int) -> Rows:
 
 
 def tokens_label(point: Mapping[Any, Any]) -> str:
-    """A point of `FutureTokens`."""
+    """A point of ``FutureTokens``."""
     alignment = float(point["alignment_weight"])
     return f"N = {int(point['num_future_tokens'])}" + (f", aligned ({alignment:g})" if alignment else "")
 
 
 def pictures_label(point: Mapping[Any, Any]) -> str:
-    """A point of `VlTokens`."""
+    """A point of ``VlTokens``."""
     size, cameras, patch = (int(point[name]) for name in ("image_size", "num_cameras", "patch_size"))
     return f"{cameras} cameras, {size} px, patches of {patch} px"
 
 
 def layers_label(point: Mapping[Any, Any]) -> str:
-    """A point of `VlSelfAttention`."""
+    """A point of ``VlSelfAttention``."""
     return f"{int(point['vl_num_layers'])} layers"
 
 

@@ -64,7 +64,7 @@ def between_runs(first: Sequence[float], second: Sequence[float], episodes: int)
 def same_policies(first: pd.DataFrame, second: pd.DataFrame) -> Estimate:
     """Difference of the success of these very policies, second minus first, on the same episodes.
 
-    The mean over the runs of a point, episode by episode; see `mean_difference`.
+    The mean over the runs of a point, episode by episode; see ``mean_difference``.
     """
     one, other = (rows.groupby(["task", "seed"])["success"].mean() for rows in (first, second))
     difference = (other - one).dropna()
@@ -76,10 +76,10 @@ def mean_difference(differences: npt.NDArray[np.float64], episodes: Sequence[Any
 
     Where few episodes differ the bootstrap interval is too narrow, and where none differs it has zero width.
     The result is therefore the union with Tango's interval for the same gains and losses. With fewer than
-    `FEWEST_EPISODES` episodes the bounds are NaN.
+    ``FEWEST_EPISODES`` episodes the bounds are NaN.
 
     Args:
-        differences: `(observations,)`, in -1..1.
+        differences: ``(observations,)``, in -1..1.
         episodes: The episode of each.
     """
     count = len(set(episodes))
