@@ -350,11 +350,11 @@ def is_special(text: str) -> bool:
 
 
 def readable(name: str) -> str:
-    """A token's string without the characters that byte-level tokenizers use for spaces and line ends.
+    r"""A token's string without the characters that byte-level tokenizers use for spaces and line ends.
 
     Example:
-        >>> readable("\\u0120puck"), readable("\\u010a")
-        ('puck', '\\\\n')
+        >>> readable("\u0120puck"), readable("\u010a")
+        ('puck', '\\n')
     """
     shown = name.replace("\u0120", " ").replace("\u010a", "\n").strip(" ").replace("\n", "\\n")
     return shown or "␣"

@@ -39,8 +39,9 @@ def tensor_names(checkpoint: Description) -> list[str]:
 def read_tensors(
     checkpoint: Description, expected: Mapping[str, torch.Size], dtype: torch.dtype
 ) -> dict[str, Tensor]:
-    """Reads the head's tensors in ``dtype``, by their names without prefix. int8 weights are multiplied by
-    their scales.
+    """Reads the head's tensors in ``dtype``, by their names without prefix.
+
+    int8 weights are multiplied by their scales.
 
     Raises:
         CheckpointError: Tensors are missing, unknown inside the prefix, or of the wrong shape. The message

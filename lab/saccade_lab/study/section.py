@@ -191,10 +191,10 @@ def not_measured(reason: str) -> str:
 
 
 def markdown_row(cells: Sequence[str]) -> str:
-    """A row of a Markdown table.
+    r"""A row of a Markdown table.
 
     Example:
         >>> markdown_row(["a", "|b|"])
-        '| a | \\\\|b\\\\| |'
+        '| a | \\|b\\| |'
     """
     return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"

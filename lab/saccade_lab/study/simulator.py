@@ -241,8 +241,10 @@ class Recorder(WrappedHead):
 def judge(
     checkpoint: str, task: str, seed: int, intervention: Intervention | None = None, engine: str = "rust"
 ) -> Episode:
-    """Runs an episode of a policy. Layout, wording and noise depend on task and seed alone, so that all
-    policies and interventions are judged on the same episodes.
+    """Runs an episode of a policy.
+
+    Layout, wording and noise depend on task and seed alone, so that all policies and interventions are judged
+    on the same episodes.
     """
     policy = policy_of(checkpoint, engine)
     return run_episode(environment_of(checkpoint, task), policy, seed, intervention=intervention)

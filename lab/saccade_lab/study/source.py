@@ -113,8 +113,9 @@ class Source(ABC):
 
     @abstractmethod
     def outcome(self, task: str, seed: int, intervention: Intervention | None) -> dict[str, Any]:
-        """Columns of the table: success and length of an episode under an intervention. Success is None
-        without a closed loop.
+        """Columns of the table: success and length of an episode under an intervention.
+
+        Success is None without a closed loop.
         """
 
     @abstractmethod

@@ -31,8 +31,9 @@ class RmsNorm(nn.Module):
 
 
 class SelfAttention(nn.Module):
-    """Causal attention whose query heads share fewer key heads. Queries and keys of each head are normalised
-    before they are rotated.
+    """Causal attention whose query heads share fewer key heads.
+
+    Queries and keys of each head are normalised before they are rotated.
     """
 
     def __init__(self, sizes: TextSizes) -> None:

@@ -200,8 +200,9 @@ class Gradients(Study):
     def of_observation(
         self, head: ActionHead, observation: HeadInputs, generator: torch.Generator
     ) -> tuple[Sensitivity, Mapping[str, torch.Tensor] | None, torch.Tensor | None]:
-        """Sensitivities; derivatives along paths, None without future tokens; and those along all paths,
-        None where nothing needs them.
+        """Sensitivities, derivatives along paths, and derivatives along all paths.
+
+        The second are None without future tokens, the third where nothing needs them.
         """
         import torch
 

@@ -321,8 +321,9 @@ class Sweep(Study):
 
     @property
     def files(self) -> tuple[str | Path, ...]:
-        """See ``Study``: finished runs, and demonstrations. Runs that are trained stay in the output
-        directory, which other machines must share.
+        """See ``Study``: finished runs, and demonstrations.
+
+        Runs that are trained stay in the output directory, which other machines must share.
         """
         finished = (path for name, path in self.runs.items() if name not in self.planned)
         return (*finished, *{plan.demonstrations for plan in self.planned.values()})
