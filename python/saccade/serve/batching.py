@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections import OrderedDict, deque
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -18,30 +18,38 @@ ACTIVE_SECONDS = 1.0
 
 @dataclass(eq=False)
 class Job:
-    """A ``get_action`` request that waits.
+    """A ``get_action`` request, from its arrival to its answer.
 
     Attributes:
         call: What it asks for.
         parsed: Its observations.
         client: Who asks.
+        frames: The frames before the request, which are sent back before the answer.
         is_msgpack_numpy: In which form its arrays came, and those of the answer go.
-        inputs: What the backbone takes, or why there is none, once it is prepared.
-        is_claimed: Whether a thread has begun to prepare it while it waits.
-        received: When it arrived, on the clock of `time.perf_counter`.
-        reply: Where the answer goes; only the server reads it.
         num_bytes: Size of the request.
+        received: When it arrived, on the clock of `time.perf_counter`.
+        is_claimed: Whether a thread has begun to prepare it while it waits.
+        inputs: What the backbone takes, once it is prepared.
+        actions: The actions, once they are computed.
+        info: What is told besides them.
+        batch: Number of observations that were computed together.
+        error: Why there are no actions.
         milliseconds: How long each part took.
     """
 
     call: Call
     parsed: ParsedObservation
-    client: Hashable
+    client: Any
+    frames: Sequence[bytes] = ()
     is_msgpack_numpy: bool = False
-    inputs: Sequence[Any] | BaseException | None = None
-    is_claimed: bool = False
-    received: float = field(default_factory=time.perf_counter)
-    reply: Any = None
     num_bytes: int = 0
+    received: float = field(default_factory=time.perf_counter)
+    is_claimed: bool = False
+    inputs: Sequence[Any] = ()
+    actions: Any = None
+    info: Mapping[str, Any] = field(default_factory=dict)
+    batch: int = 0
+    error: BaseException | None = None
     milliseconds: dict[str, float] = field(default_factory=dict)
 
     @property

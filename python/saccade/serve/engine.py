@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import itertools
 import threading
 import time
-from collections.abc import Hashable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -37,41 +38,16 @@ PARTS = ("wait", "inputs", "backbone", "head")
 SMALL_BACKBONE = 16 << 20
 
 
-@dataclass(frozen=True, eq=False)
-class Outcome:
-    """What became of a request.
-
-    Attributes:
-        job: The request.
-        actions: The actions, if ``error`` is None.
-        info: What is told besides them.
-        error: Why there are none.
-        batch: Number of observations that were computed together.
-    """
-
-    job: Job
-    actions: Any = None
-    info: Mapping[str, Any] = field(default_factory=dict)
-    error: BaseException | None = None
-    batch: int = 0
-
-
 @dataclass(eq=False)
 class _Work:
     """A request while it is computed."""
 
     job: Job
-    inputs: Sequence[Any]
     noise: Float32Array
     session: Session | None
     continued: tuple[Chunk, Chunking] | None
     num_steps: int | None
     features: Sequence[Any] = ()
-
-    @property
-    def group(self) -> Hashable:
-        """Requests for which it is equal are sampled together."""
-        return (None if self.continued is None else self.continued[1], self.num_steps)
 
 
 class Engine:
@@ -100,19 +76,15 @@ class Engine:
 
     def prepare(self, job: Job) -> None:
         """Prepares what the backbone takes of a request; nothing happens if it is prepared."""
-        if job.inputs is None:
+        if not job.inputs and job.error is None:
             with _timed([job], "inputs"):
                 try:
                     job.inputs = prepare_inputs([job.parsed], self._processor)
                 except BaseException as error:
-                    job.inputs = error
+                    job.error = error
 
-    def run(self, jobs: Sequence[Job]) -> list[Outcome]:
-        """Computes requests together. One that cannot be computed does not affect the others.
-
-        Returns:
-            What became of each, in no particular order.
-        """
+    def run(self, jobs: Sequence[Job]) -> Sequence[Job]:
+        """Computes the actions or the error of requests. An error of one does not affect the others."""
         for job in jobs:
             waited = 1e3 * (time.perf_counter() - job.received)
             job.milliseconds["wait"] = waited - job.milliseconds.get("inputs", 0.0)
@@ -120,7 +92,8 @@ class Engine:
             # A request that is computed alone has all threads.
             alone = self.num_workers > 1 and (running > 1 or len(jobs) > 1)
             with _saccade.stay_on_this_thread() if alone else nullcontext():
-                return self._outcomes(jobs)
+                self._compute(jobs)
+        return jobs
 
     @contextmanager
     def _running_threads(self) -> Iterator[int]:
@@ -134,35 +107,19 @@ class Engine:
             with self._lock:
                 self._running -= 1
 
-    def _outcomes(self, jobs: Sequence[Job]) -> list[Outcome]:
-        begun = [self._begun(job) for job in jobs]
-        outcomes = [one for one in begun if isinstance(one, Outcome)]
-        works = [one for one in begun if isinstance(one, _Work)]
-        try:
-            return outcomes + self._together(works)
-        except BaseException as error:
-            if len(works) < 2:
-                return outcomes + [Outcome(work.job, error=error) for work in works]
-        # One of them is the cause, or there is not enough memory for all of them.
-        for work in works:
-            try:
-                outcomes += self._together([work])
-            except BaseException as error:
-                outcomes.append(Outcome(work.job, error=error))
-        return outcomes
+    def _compute(self, jobs: Sequence[Job]) -> None:
+        works = []
+        for job in jobs:
+            self.prepare(job)
+            if job.error is None:
+                try:
+                    works.append(self._begun(job))
+                except BaseException as error:
+                    job.error = error
+        if works:
+            self._try(works)
 
-    def _begun(self, job: Job) -> _Work | Outcome:
-        """A request that can be computed, or why it cannot."""
-        self.prepare(job)
-        try:
-            return self._begin(job)
-        except BaseException as error:
-            return Outcome(job, error=error)
-
-    def _begin(self, job: Job) -> _Work:
-        assert job.inputs is not None
-        if isinstance(job.inputs, BaseException):
-            raise job.inputs
+    def _begun(self, job: Job) -> _Work:
         options, config = job.call.options, self._policy.head.config
         shape = (job.rows, config.action_horizon, config.encoder_action_dim)
         session = continued = None
@@ -170,44 +127,50 @@ class Engine:
             session = self._sessions.use(options.session, job.client)
             continued = session.continued(options, job.rows)
         noise = noise_or_draw(None, options.seed, shape)
-        return _Work(job, job.inputs, noise, session, continued, options.num_steps or self._num_steps)
+        return _Work(job, noise, session, continued, options.num_steps or self._num_steps)
 
-    def _together(self, works: Sequence[_Work]) -> list[Outcome]:
-        if not works:
-            return []
-        every = [one for work in works for one in work.inputs]
+    def _try(self, works: Sequence[_Work]) -> None:
+        """Computes requests together, or if that fails each alone."""
+        try:
+            self._together(works)
+            return
+        except BaseException as error:
+            if len(works) == 1:
+                works[0].job.error = error
+                return
+        # One of them is the cause, or there is not enough memory for all of them, which is free only here.
+        for work in works:
+            self._try([work])
+
+    def _together(self, works: Sequence[_Work]) -> None:
+        inputs = [one for work in works for one in work.job.inputs]
         with _timed([work.job for work in works], "backbone"):
-            features = compute_features(every, self._backbone)
-        start = 0
+            features = iter(compute_features(inputs, self._backbone))
+        groups: dict[tuple[Chunking | None, int | None], list[_Work]] = {}
         for work in works:
-            work.features = features[start : start + len(work.inputs)]
-            start += len(work.inputs)
-        groups: dict[Hashable, list[_Work]] = {}
-        for work in works:
-            groups.setdefault(work.group, []).append(work)
-        outcomes = []
-        for group in groups.values():
+            work.features = list(itertools.islice(features, len(work.job.inputs)))
+            chunking = None if work.continued is None else work.continued[1]
+            groups.setdefault((chunking, work.num_steps), []).append(work)
+        for (chunking, num_steps), group in groups.items():
             with _timed([work.job for work in group], "head"):
-                outcomes += self._sampled(group, len(every))
-        return outcomes
+                self._sample(group, chunking, num_steps, len(inputs))
 
-    def _sampled(self, works: Sequence[_Work], batch: int) -> list[Outcome]:
-        first = works[0].continued
+    def _sample(
+        self, works: Sequence[_Work], chunking: Chunking | None, num_steps: int | None, batch: int
+    ) -> None:
         previous = [work.continued[0].actions for work in works if work.continued is not None]
         found = self._policy.sample(
             encode_features([one for work in works for one in work.features], self._policy.head),
             [work.job.parsed for work in works],
             noise=np.concatenate([work.noise for work in works]),
-            num_steps=works[0].num_steps,
-            previous_chunk=None if first is None else previous,
-            chunking=None if first is None else first[1],
+            num_steps=num_steps,
+            previous_chunk=previous or None,
+            chunking=chunking,
         )
-        outcomes = []
         for work, actions in zip(works, found, strict=True):
             if work.session is not None:
-                work.session.chunk = Chunk(actions, len(work.inputs), _horizon(actions))
-            outcomes.append(Outcome(work.job, actions, _info(work), batch=batch))
-        return outcomes
+                work.session.chunk = Chunk(actions, work.job.rows, _horizon(actions))
+            work.job.actions, work.job.info, work.job.batch = actions, _info(work), batch
 
 
 @contextmanager

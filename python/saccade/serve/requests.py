@@ -133,36 +133,18 @@ def check_num_steps(name: str, value: int, num_timestep_buckets: int) -> int:
     return number
 
 
-def action_answer(call: Call, actions: Any, info: Mapping[str, Any]) -> Any:
-    """The answer to ``get_action`` in the form of the request."""
-    return actions if call.is_bare else [actions, dict(info)]
+def is_allowed(value: Any, secret: str | None) -> bool:
+    """Whether a message contains the secret, if there is one. The time that this takes says nothing about it.
 
-
-class Token:
-    """The secret that every request must contain, if there is one.
-
-    Args:
-        secret: The secret, or None.
+    Example:
+        >>> is_allowed({"endpoint": "ping", "api_token": "guess"}, "secret"), is_allowed({}, None)
+        (False, True)
     """
-
-    def __init__(self, secret: str | None) -> None:
-        self._digest = None if secret is None else _digest(secret)
-
-    def allows(self, value: Any) -> bool:
-        """Whether a request contains the secret. The time that this takes says nothing about it.
-
-        Args:
-            value: The unpacked message.
-
-        Example:
-            >>> Token("secret").allows({"endpoint": "ping", "api_token": "guess"}), Token(None).allows({})
-            (False, True)
-        """
-        if self._digest is None:
-            return True
-        given = value.get("api_token") if isinstance(value, dict) else None
-        digest = _digest(given if isinstance(given, str) else "")
-        return hmac.compare_digest(digest, self._digest) and isinstance(given, str)
+    if secret is None:
+        return True
+    given = value.get("api_token") if isinstance(value, dict) else None
+    is_same = hmac.compare_digest(_digest(given if isinstance(given, str) else ""), _digest(secret))
+    return is_same and isinstance(given, str)
 
 
 def _digest(text: str) -> bytes:

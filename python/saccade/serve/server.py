@@ -15,16 +15,17 @@ from typing import TYPE_CHECKING, Any
 import saccade.observations as observations
 from saccade._internal import hub
 from saccade.errors import InputError, SaccadeError, printable
-from saccade.serve import engine, modalities, pickles
+from saccade.serve import modalities, pickles
 from saccade.serve.batching import Job, Queue
+from saccade.serve.engine import Engine
 from saccade.serve.keys import ServerKeys
 from saccade.serve.limits import Limits
 from saccade.serve.logs import Log
 from saccade.serve.packing import pack, unpack
-from saccade.serve.requests import PING, UNAUTHORIZED, Call, Token, action_answer, check_num_steps, parse
+from saccade.serve.requests import PING, UNAUTHORIZED, Call, check_num_steps, is_allowed, parse
 from saccade.serve.sessions import Sessions
 from saccade.serve.statistics import Statistics
-from saccade.serve.transport import Envelope, Peer, Transport, address_of
+from saccade.serve.transport import Peer, Transport, address_of
 
 if TYPE_CHECKING:
     from saccade.policy.policy import Policy
@@ -93,21 +94,19 @@ class Server:
         modality_form: str | None = None,
     ) -> None:
         self._policy, self._log, self._limits = policy, log, limits
-        self._token = Token(api_token)
-        self._allow_kill = allow_kill
-        self._seed = seed
+        self._seed, self._api_token, self._allow_kill = seed, api_token, allow_kill
         self._most_steps = policy.head.config.num_timestep_buckets
         if num_steps is not None:
             num_steps = check_num_steps("num_steps", num_steps, self._most_steps)
         self._modalities = modalities.answers(policy)
         self._form = modality_form or modalities.form_of(policy.head.config.version)
         self._sessions = Sessions(limits.sessions, limits.session_seconds)
-        self._engine = engine.Engine(policy, self._sessions, num_steps)
+        self._engine = Engine(policy, self._sessions, num_steps)
         self.num_workers = min(self._engine.num_workers, max_batch)
         self._queue = Queue(max_batch, max_wait_ms / 1e3, self._engine.prepare, self.num_workers)
         self._statistics = Statistics()
         self.address = address_of(listener)
-        self._finished: deque[tuple[engine.Outcome, bytes]] = deque()
+        self._finished: deque[tuple[Job, bytes]] = deque()
         self._unanswered = self._unanswered_bytes = 0
         self._stopping: str | None = None
         self._is_draining = False
@@ -155,8 +154,8 @@ class Server:
         spoken = watched = time.monotonic()
         try:
             while not self._is_done():
-                for envelope, payload in self._transport.requests(0.05 if self._stopping else 0.5):
-                    self._on_request(envelope, payload)
+                for request in self._transport.requests(0.05 if self._stopping else 0.5):
+                    self._on_request(*request)
                 self._send_finished()
                 now = time.monotonic()
                 if now - spoken >= self._log.every:
@@ -183,10 +182,10 @@ class Server:
             self._queue.close()
         return not self._unanswered
 
-    def _on_request(self, envelope: Envelope, payload: memoryview) -> None:
+    def _on_request(self, client: Peer, frames: list[bytes], payload: memoryview) -> None:
         """Answers a request at once, or appends it to the queue."""
         received = time.perf_counter()
-        client, endpoint, error = envelope.peer, "unreadable", None
+        endpoint, error = "unreadable", None
         try:
             if client.chose_identity:
                 raise InputError(
@@ -197,29 +196,23 @@ class Server:
                 error, answer = pickles.REFUSAL, pickles.refusal(payload)
             else:
                 message = unpack(payload, self._limits)
-                if not self._token.allows(message.value):
+                if not is_allowed(message.value, self._api_token):
                     raise InputError(UNAUTHORIZED)
                 call = parse(message.value, self._most_steps, self._seed)
                 endpoint = call.endpoint
                 if endpoint == "get_action":
                     parsed = self._read(call, len(payload))
-                    self._enqueue(
-                        Job(
-                            call,
-                            parsed,
-                            client,
-                            message.is_msgpack_numpy,
-                            received=received,
-                            reply=envelope,
-                            num_bytes=len(payload),
-                        )
-                    )
+                    client.modality_form = "text" if call.is_bare else "map"
+                    self._unanswered += 1
+                    self._unanswered_bytes += len(payload)
+                    form = message.is_msgpack_numpy
+                    self._queue.put(Job(call, parsed, client, frames, form, len(payload), received))
                     return
                 answer = pack(self._answer(client, call))
         except Exception as caught:
             error = describe(caught)
             answer = pack({"error": error})
-        self._transport.send(envelope, answer)
+        self._transport.send(client, frames, answer)
         self._note(client, endpoint, error)
 
     def _answer(self, client: Peer, call: Call) -> Any:
@@ -249,35 +242,20 @@ class Server:
             )
         return observations.read(call.observation, self._policy.requirements, self._limits.rows)
 
-    def _enqueue(self, job: Job) -> None:
-        job.reply.peer.modality_form = "text" if job.call.is_bare else "map"
-        self._unanswered += 1
-        self._unanswered_bytes += job.num_bytes
-        self._queue.put(job)
-
     def _compute(self) -> None:
         """What a thread does that computes."""
         while (jobs := self._queue.take()) is not None:
-            dropped = {job: error for job in jobs if (error := self._dropped(job)) is not None}
-            outcomes = [engine.Outcome(job, error=error) for job, error in dropped.items()]
-            outcomes += self._engine.run([job for job in jobs if job not in dropped])
+            for job in jobs:
+                job.error = self._dropped(job) or job.error
+            self._engine.run([job for job in jobs if not isinstance(job.error, Dropped)])
             self._queue.done(jobs)
-            for outcome in outcomes:
-                payload = None
-                if outcome.error is None:
-                    try:
-                        payload = self._packed(outcome)
-                    except Exception as error:
-                        outcome = engine.Outcome(outcome.job, error=error)
-                if payload is None:
-                    assert outcome.error is not None
-                    payload = pack({"error": describe(outcome.error)})
-                self._finished.append((outcome, payload))
+            for job in jobs:
+                self._finished.append((job, self._packed(job)))
             self._transport.wake()
 
     def _dropped(self, job: Job) -> Dropped | None:
         """Why a request is not computed, if nobody waits for its answer any more."""
-        if not job.reply.peer.is_connected:
+        if not job.client.connection.is_open:
             return Dropped("gone", "dropped: its client is gone")
         waited = time.perf_counter() - job.received
         if waited > self._limits.request_seconds:
@@ -288,41 +266,40 @@ class Server:
             )
         return None
 
-    def _packed(self, outcome: engine.Outcome) -> bytes:
-        """The answer of a request that was computed."""
-        job = outcome.job
-        latency = round(1e3 * (time.perf_counter() - job.received), 3)
-        answer = action_answer(job.call, outcome.actions, {**outcome.info, "latency_ms": latency})
-        return pack(answer, as_msgpack_numpy=job.is_msgpack_numpy)
+    def _packed(self, job: Job) -> bytes:
+        """The answer of a request that was computed or dropped."""
+        if job.error is None:
+            try:
+                latency = round(1e3 * (time.perf_counter() - job.received), 3)
+                info = {**job.info, "latency_ms": latency}
+                answer = job.actions if job.call.is_bare else [job.actions, info]
+                return pack(answer, as_msgpack_numpy=job.is_msgpack_numpy)
+            except Exception as error:
+                job.error = error
+        return pack({"error": describe(job.error)})
 
     def _send_finished(self) -> None:
         while self._finished:
-            outcome, payload = self._finished.popleft()
-            job = outcome.job
-            is_sent = self._transport.send(job.reply, payload)
+            job, payload = self._finished.popleft()
+            is_sent = self._transport.send(job.client, job.frames, payload)
             self._unanswered -= 1
             self._unanswered_bytes -= job.num_bytes
-            error = None if outcome.error is None else describe(outcome.error)
-            if isinstance(outcome.error, Dropped):
-                self._statistics.dropped[outcome.error.why] += 1
+            error = None if job.error is None else describe(job.error)
+            milliseconds = {**job.milliseconds, "total": 1e3 * (time.perf_counter() - job.received)}
+            batch = job.batch if error is None else 0
+            if error is None:
+                self._statistics.computed(batch, milliseconds)
+            if isinstance(job.error, Dropped):
+                self._statistics.dropped[job.error.why] += 1
             elif not is_sent:
                 self._statistics.dropped["unsent"] += 1
                 error = error or "computed, but its client is gone or does not read"
-            total = 1e3 * (time.perf_counter() - job.received)
-            if outcome.error is None:
-                self._statistics.computed(outcome, total)
-            milliseconds = {**job.milliseconds, "total": total}
-            self._note(
-                job.reply.peer,
-                "get_action",
-                error,
-                batch=outcome.batch,
-                milliseconds={part: round(value, 3) for part, value in milliseconds.items()},
-            )
+            rounded = {part: round(value, 3) for part, value in milliseconds.items()}
+            self._note(job.client, "get_action", error, batch=batch, milliseconds=rounded)
 
     def _note(self, client: Peer, endpoint: str, error: str | None, **fields: Any) -> None:
         self._statistics.count(endpoint, is_error=error is not None)
-        self._log.request(client=client.name, endpoint=endpoint, error=error, **fields)
+        self._log.request(client=client.connection.name, endpoint=endpoint, error=error, **fields)
 
     def _warn(self, client: str, message: str) -> None:
         self._log.event("warning", client=client, message=message)

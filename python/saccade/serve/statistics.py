@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import time
 from collections import Counter, deque
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
-from saccade.serve.engine import PARTS, Outcome
+from saccade.serve.engine import PARTS
 
 #: Latencies are those of so many answers, the last ones.
 WINDOW = 1024
@@ -29,28 +30,16 @@ class Statistics:
         self.errors = 0
         self.dropped: Counter[str] = Counter()
         self._started = time.monotonic()
-        self._milliseconds: dict[str, deque[float]] = {
-            part: deque(maxlen=WINDOW) for part in (*PARTS, "total")
-        }
-        self._batches: deque[int] = deque(maxlen=WINDOW)
-        self._times: deque[float] = deque(maxlen=WINDOW)
+        self._computed: deque[tuple[float, int, Mapping[str, float]]] = deque(maxlen=WINDOW)
 
     def count(self, endpoint: str, *, is_error: bool) -> None:
         """Counts a request."""
         self.requests[endpoint] += 1
         self.errors += is_error
 
-    def computed(self, outcome: Outcome, total: float) -> None:
-        """Takes notice of actions.
-
-        Args:
-            outcome: What was computed.
-            total: Milliseconds from the arrival of the request to its answer.
-        """
-        for part, milliseconds in {**outcome.job.milliseconds, "total": total}.items():
-            self._milliseconds[part].append(milliseconds)
-        self._batches.append(outcome.batch)
-        self._times.append(time.monotonic())
+    def computed(self, batch: int, milliseconds: Mapping[str, float]) -> None:
+        """Takes notice of actions, of which so many observations were computed together."""
+        self._computed.append((time.monotonic(), batch, milliseconds))
 
     def summary(self) -> dict[str, Any]:
         """Everything, for JSON.
@@ -60,22 +49,20 @@ class Statistics:
             ``batch`` (mean number of observations computed together, as a request sees it), and
             ``milliseconds``: ``p50`` and ``p99`` by part.
         """
-        span = time.monotonic() - self._times[0] if self._times else 0.0
+        now, batches = time.monotonic(), [batch for _, batch, _ in self._computed]
+        span = now - self._computed[0][0] if self._computed else 0.0
+        parts = {}
+        for part in (*PARTS, "total") if self._computed else ():
+            p50, p99 = np.percentile([took[part] for *_, took in self._computed], (50, 99))
+            parts[part] = {"p50": round(float(p50), 3), "p99": round(float(p99), 3)}
         return {
-            "seconds": round(time.monotonic() - self._started, 3),
+            "seconds": round(now - self._started, 3),
             "requests": dict(self.requests),
             "errors": self.errors,
             "dropped": dict(self.dropped),
-            "per_second": round(len(self._times) / span, 3) if span > 0 else 0.0,
-            "batch": round(float(np.mean(self._batches)), 2) if self._batches else 0.0,
-            "milliseconds": {
-                part: {
-                    "p50": round(float(np.percentile(values, 50)), 3),
-                    "p99": round(float(np.percentile(values, 99)), 3),
-                }
-                for part, values in self._milliseconds.items()
-                if values
-            },
+            "per_second": round(len(self._computed) / span, 3) if span > 0 else 0.0,
+            "batch": round(float(np.mean(batches)), 2) if batches else 0.0,
+            "milliseconds": parts,
         }
 
 

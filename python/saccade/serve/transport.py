@@ -13,7 +13,7 @@ import errno
 import os
 import socket
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import zmq
@@ -58,7 +58,7 @@ class Connection:
 
     Attributes:
         name: Its address and port.
-        is_open: Whether it is still connected. Any thread may read it.
+        is_open: Whether it is still connected. True in doubt. Any thread may read it.
         peers: The clients that were seen on it; more than one only if libzmq's events came late.
     """
 
@@ -105,32 +105,9 @@ class Peer:
     modality_form: str | None = None
 
     @property
-    def name(self) -> str:
-        """Its address and port."""
-        return self.connection.name
-
-    @property
-    def is_connected(self) -> bool:
-        """Whether it is still connected. True in doubt. Any thread may ask."""
-        return self.connection.is_open
-
-    @property
     def chose_identity(self) -> bool:
         """Whether its socket has a routing id of its own, which another client may have after it."""
         return not (len(self.identity) == 5 and self.identity.startswith(b"\0"))
-
-
-@dataclass(frozen=True, eq=False)
-class Envelope:
-    """Where the answer to a request goes.
-
-    Attributes:
-        peer: Who sent the request.
-        frames: The frames before the request, which are sent back before the answer.
-    """
-
-    peer: Peer
-    frames: tuple[bytes, ...]
 
 
 class Transport:
@@ -195,14 +172,11 @@ class Transport:
         with contextlib.suppress(OSError):  # it is awake, or closed
             self._waker.send(b"\0")
 
-    def requests(self, timeout: float) -> Iterator[tuple[Envelope, memoryview]]:
-        """The requests that have arrived, or that arrive within a time.
-
-        Args:
-            timeout: The longest time to wait for one, in seconds.
+    def requests(self, timeout: float) -> Iterator[tuple[Peer, list[bytes], memoryview]]:
+        """The requests that have arrived, or that arrive within a number of seconds.
 
         Yields:
-            Where the answer of a request goes, and the request.
+            The client, the frames before the request, which go before the answer, and the request.
         """
         if any(ready == self._woken.fileno() for ready, _ in self._poller.poll(int(1e3 * timeout))):
             with contextlib.suppress(BlockingIOError):
@@ -218,21 +192,18 @@ class Transport:
             if len(frames) > MOST_ENVELOPE_FRAMES or any(
                 len(frame) > MOST_ENVELOPE_BYTES for frame in frames
             ):
-                self._on_problem(peer.name, "expected a request in one frame, got several; ignored")
+                self._on_problem(
+                    peer.connection.name, "expected a request in one frame, got several; ignored"
+                )
                 continue
-            yield Envelope(peer, tuple(frame.bytes for frame in frames)), payload.buffer
+            yield peer, [frame.bytes for frame in frames], payload.buffer
 
-    def send(self, envelope: Envelope, answer: bytes) -> bool:
-        """Answers a request.
-
-        Returns:
-            Whether the answer is on its way; False if the client is gone or does not read its answers.
-        """
-        peer = envelope.peer
+    def send(self, peer: Peer, frames: Sequence[bytes], answer: bytes) -> bool:
+        """Whether the answer is on its way; False if the client is gone or does not read its answers."""
         try:
-            self._router.send_multipart([peer.identity, *envelope.frames, answer], zmq.NOBLOCK)
+            self._router.send_multipart([peer.identity, *frames, answer], zmq.NOBLOCK)
         except zmq.Again:
-            self._on_problem(peer.name, "does not read its answers; one was not sent")
+            self._on_problem(peer.connection.name, "does not read its answers; one was not sent")
             return False
         except zmq.ZMQError as error:
             if error.errno != errno.EHOSTUNREACH:
