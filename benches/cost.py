@@ -17,10 +17,10 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from benches.work import ATTENTION, Work, Works, encode_work, sample_work
-from saccade.cli import bench
-from saccade.cli.timing import Call, Machine, arithmetic_of, by_turns, works_of
 from saccade.head.config import HeadConfig
 from saccade.head.head import ActionHead
+from saccade_lab.cli import bench
+from saccade_lab.timing import Call, Machine, arithmetic_of, by_turns, works_of
 
 #: Bytes of a weight, or of a cached key or value, in memory. A float32 head keeps weights that are stored as
 #: bfloat16 in bfloat16. Floors that reading sets are then too high, which may happen where only action rows

@@ -16,8 +16,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from saccade.cli import bench
-from saccade.cli.timing import Machine, arithmetic_of
+from saccade_lab.cli import bench
+from saccade_lab.timing import Machine, arithmetic_of
 
 #: Columns and rows of the picture in text.
 WIDTH, HEIGHT = 64, 16

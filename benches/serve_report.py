@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from benches.peers.text import table
-from saccade.cli.timing import quartiles
+from saccade_lab.timing import quartiles
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGE = ROOT / "docs" / "results" / "serve.md"

@@ -8,8 +8,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from saccade.cli.timing import Call
 from saccade.head.config import HeadConfig
+from saccade_lab.timing import Call
 
 #: Parts whose operands are keys, values and probabilities rather than weights.
 ATTENTION = ("attention",)

@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import saccade
-from saccade.checkpoints.random_head import config_of_size, write_head
+from saccade_lab.random_checkpoint.head import config_of_size, write_head
 
 Float32Array = NDArray[np.float32]
 EMBODIMENT_ID = 0

@@ -12,7 +12,7 @@ from benches.backbone.work import backbone_work, floor_seconds
 from benches.peers.results import TOLERANCE
 from benches.peers.text import plural, table
 from saccade.checkpoints.backbone_sizes import BackboneSizes
-from saccade.cli.timing import Machine, quartiles
+from saccade_lab.timing import Machine, quartiles
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "results" / "backbone.md"
 COMMITTED = Path(__file__).with_name("results.json")

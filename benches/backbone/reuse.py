@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from benches.backbone import setup
-from saccade.cli.timing import by_turns
+from saccade_lab.timing import by_turns
 
 #: The pieces, and which views of the next observation are new.
 PIECES: dict[str, tuple[int, ...] | None] = {

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from benches.cost import ELEMENT_BYTES
 from benches.work import Work, Works, add_linear
 from saccade.checkpoints.backbone_sizes import BackboneSizes
-from saccade.cli.timing import Machine
+from saccade_lab.timing import Machine
 
 #: Parts whose operands are keys, values and probabilities rather than weights.
 ATTENTION = ("vision_attention", "language_attention")

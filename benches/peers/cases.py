@@ -7,7 +7,7 @@ from typing import Any
 
 from benches.work import encode_work, sample_work, total
 from saccade import HeadConfig
-from saccade.cli.timing import Call
+from saccade_lab.timing import Call
 
 NUM_BLOCKS = 4  # of the piece "blocks": cross, self, cross, self
 LINEAR_SHAPES = ((49, 1536, 6144), (49, 6144, 1536), (49, 1536, 1536), (296, 2048, 1536))

@@ -9,7 +9,7 @@ from benches.peers.cases import COST, Case
 from benches.peers.contenders import CONTENDERS
 from benches.peers.results import Results
 from benches.peers.text import plural, usual
-from saccade.cli.timing import quartiles
+from saccade_lab.timing import quartiles
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

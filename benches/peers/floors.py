@@ -11,7 +11,7 @@ from benches.peers.results import Results
 from benches.peers.text import arithmetic, calls, config
 from benches.work import Works, encode_work, sample_work
 from saccade._internal.arrays import PRECISIONS
-from saccade.cli.timing import Call, Machine
+from saccade_lab.timing import Call, Machine
 
 
 def limits(results: Results, case: Case, name: str) -> tuple[float, float] | None:

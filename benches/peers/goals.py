@@ -9,7 +9,7 @@ from benches.peers.contenders import CONTENDERS
 from benches.peers.floors import floor
 from benches.peers.results import Results
 from benches.peers.text import percent, plural, table, usual
-from saccade.cli.timing import quartiles
+from saccade_lab.timing import quartiles
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from benches.peers.goals import Goal, reached
 from benches.peers.report import demoted, joined, said_of
 from benches.peers.results import Results, records
 from benches.peers.text import number, plural, table, usual
-from saccade.cli.timing import quartiles
+from saccade_lab.timing import quartiles
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "results" / "policy-speed.md"
 NOTES = Path(__file__).with_name("policy_notes.md")

@@ -27,7 +27,7 @@ from benches.peers.text import (
     usual,
 )
 from benches.peers.throughput import throughput
-from saccade.cli.timing import quartiles
+from saccade_lab.timing import quartiles
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "results" / "performance.md"
 IMAGES = PAGE.parent

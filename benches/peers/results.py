@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from benches.peers.cases import Case
-from saccade.cli.timing import quartiles
+from saccade_lab.timing import quartiles
 
 FORMAT = 1
 RECORDS = Path(__file__).with_name("results")

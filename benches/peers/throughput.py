@@ -7,7 +7,7 @@ from benches.peers.contenders import CONTENDERS
 from benches.peers.floors import limits
 from benches.peers.results import Results
 from benches.peers.text import plural, table
-from saccade.cli.timing import quartiles
+from saccade_lab.timing import quartiles
 
 
 def throughput(results: Results) -> list[str]:

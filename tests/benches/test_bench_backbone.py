@@ -17,9 +17,9 @@ from benches.backbone import accuracy, memory, peer, report, setup
 from benches.backbone.work import backbone_work, floor_seconds
 from benches.work import total
 from saccade.checkpoints.backbone_sizes import BackboneSizes
-from saccade.cli.timing import Machine
 from saccade_lab import random_checkpoint
 from saccade_lab.reference import Backbone
+from saccade_lab.timing import Machine
 
 PUBLISHED = BackboneSizes.from_config({"kind": "n1.5 backbone"})
 

@@ -15,9 +15,9 @@ from benches.cost import floors, measured_like, predict
 from benches.work import encode_work, sample_work, total
 from saccade import _saccade
 from saccade._internal.arrays import PRECISIONS
-from saccade.checkpoints.random_head import config_of_size, write_head
-from saccade.cli.timing import Call, Machine, profiled, works_of
 from saccade.head.config import HeadConfig
+from saccade_lab.random_checkpoint.head import config_of_size, write_head
+from saccade_lab.timing import Call, Machine, profiled, works_of
 
 GIGA = 10**9
 

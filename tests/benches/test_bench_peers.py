@@ -27,8 +27,8 @@ from benches.peers.machine import describe, family_name
 from benches.peers.processes import difference
 from benches.peers.results import Results, records
 from benches.peers.throughput import throughput
-from saccade.cli.timing import Call, quartiles
 from saccade_lab.reference.random_weights import sized_config
+from saccade_lab.timing import Call, quartiles
 
 ROOT = Path(__file__).resolve().parents[2]
 N15 = saccade.HeadConfig.from_dict(sized_config("n1.5"))

@@ -14,12 +14,12 @@ from torch import Tensor, nn
 
 import saccade
 from saccade import BackboneInputs, InputError
-from saccade.checkpoints import random_tensors
 from saccade.checkpoints.backbone_sizes import BackboneSizes
 from saccade.checkpoints.published import RELEASED
-from saccade.checkpoints.random_tensors import Outliers, bfloat16, blocks
 from saccade_lab.random_checkpoint import small_backbone, small_head, write
+from saccade_lab.random_checkpoint import tensors as random_tensors
 from saccade_lab.random_checkpoint.__main__ import main
+from saccade_lab.random_checkpoint.tensors import Outliers, bfloat16, blocks
 from saccade_lab.random_checkpoint.tokenizer import tokenizer
 from saccade_lab.reference import Backbone
 

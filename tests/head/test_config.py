@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 import saccade
-from saccade.checkpoints.random_head import config_of_size
+from saccade_lab.random_checkpoint.head import config_of_size
 from saccade_lab.reference.random_weights import CONFIGS, small_config, whole_config
 
 Config = dict[str, Any]

@@ -14,11 +14,11 @@ import saccade._saccade as _saccade
 from saccade._internal.files import write_json
 from saccade.checkpoints.backbone_sizes import BackboneSizes, eagle_config, merged
 from saccade.checkpoints.published import CONFIGS, RELEASED, small_config, whole_config
-from saccade.checkpoints.random_tensors import Outliers, Tensor, write_file
 from saccade.errors import InputError
 from saccade.robots.data_configs import LANGUAGE_KEY
 from saccade_lab.random_checkpoint.backbone_tensors import tensor_shapes, unread_tensor_shapes
 from saccade_lab.random_checkpoint.robot_metadata import metadata
+from saccade_lab.random_checkpoint.tensors import Outliers, Tensor, write_file
 from saccade_lab.random_checkpoint.tokenizer import FIRST_ADDED, token_id, tokenizer
 
 #: The robot of the checkpoint: its tag and published id, the width of each group of joints, its cameras.
@@ -100,7 +100,7 @@ def write(
             published sizes.
         seed: Of all tensors and statistics.
         head_dtype: ``"BF16"`` or ``"F32"``, as published. The backbone is bfloat16.
-        outliers: Plants outliers; see :class:`saccade.checkpoints.random_tensors.Outliers`.
+        outliers: Plants outliers; see :class:`saccade_lab.random_checkpoint.tensors.Outliers`.
         shard_bytes: A shard is complete when it reaches this size.
 
     Returns:

@@ -2,7 +2,7 @@
 
 `description` recognises layout and version, and `inspection` examines every tensor. `rewriting` quantises,
 converts and resizes. `precisions` compares the precisions of a whole checkpoint, and `comparison` the actions
-of a checkpoint and its resized copy. `random_head` writes heads of the sizes in `published`, for timing.
+of a checkpoint and its resized copy.
 """
 
 from saccade.checkpoints.bundled import demo_checkpoint

@@ -33,7 +33,6 @@ from saccade.errors import SaccadeError
 COMMANDS: dict[str, str] = {
     "act": "run a whole checkpoint on pictures and an instruction",
     "serve": "serve a whole checkpoint to robots and simulators over the network",
-    "bench": "time the action head and compare it with the limits of this machine",
     "inspect": "show what a checkpoint contains",
     "resize": "write a checkpoint with another number of future tokens",
     "convert": "write a checkpoint with other embodiments, dtype or shards, or merge a LoRA adapter",
@@ -48,6 +47,7 @@ LAB_COMMANDS: dict[str, str] = {
     "attention": "show what the rows of the action head attend to",
     "study": "measure what the parts of an action head contribute",
     "parity": "compare the Rust head with the torch reference",
+    "bench": "time the action head and compare it with the limits of this machine",
 }
 LAB = "saccade-vla-lab"
 ENTRY_POINTS = "saccade.commands"

@@ -12,11 +12,11 @@ import pytest
 from tiny_plan import PLAN, RECORDING, TASK, TINY, recipe
 
 from benches.work import encode_work, sample_work, total
-from saccade.cli.timing import Call
 from saccade.errors import InputError
 from saccade_lab.reference.layers import TABLE_STD
 from saccade_lab.sim import graphics
 from saccade_lab.sim.policy import num_vl_tokens
+from saccade_lab.timing import Call
 from saccade_lab.training import train
 from saccade_lab.training.learner import new_learner
 from saccade_lab.training.settings import TrainingSettings

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from benches.work import encode_work, sample_work, total
-from saccade.cli.timing import Call
+from saccade_lab.timing import Call
 from saccade_lab.training.settings import TrainingSettings
 from why_32.plan import Recording
 

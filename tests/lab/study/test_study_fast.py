@@ -11,8 +11,8 @@ import pytest
 import torch
 
 import saccade
-from saccade.checkpoints import random_head
 from saccade.cli import main
+from saccade_lab.random_checkpoint import head as random_head
 from saccade_lab.reference import ActionHead as Reference
 from saccade_lab.reference import random_weights
 from saccade_lab.sim import graphics

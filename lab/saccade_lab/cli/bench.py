@@ -19,15 +19,17 @@ from saccade._internal import flags as arguments
 from saccade._internal.arrays import PRECISIONS
 from saccade._internal.flags import UsageError
 from saccade._internal.hub import resolve
-from saccade.checkpoints import random_head
 from saccade.checkpoints.bundled import demo_checkpoint
 from saccade.checkpoints.whole import robots_of
 from saccade.cli import EXIT_OK, output
-from saccade.cli.timing import Call, Counter, Machine, arithmetic_of, by_turns, profiled, quartiles, works_of
 from saccade.errors import SaccadeError
 from saccade.head.head import ActionHead
 from saccade.processor import Processor
+from saccade_lab.extras import LAB
+from saccade_lab.random_checkpoint import head as random_head
+from saccade_lab.timing import Call, Counter, Machine, arithmetic_of, by_turns, profiled, quartiles, works_of
 
+EXTRAS = LAB
 HELP = "time the action head and compare it with the limits of this machine"
 EPILOG = """\
 The floor of a part is the longer of two times: its multiply-adds at the peak rate of their arithmetic, and

@@ -12,9 +12,9 @@ import pytest
 import saccade
 from saccade import _saccade
 from saccade._internal.arrays import PRECISIONS
-from saccade.checkpoints.random_head import config_of_size, write_head
 from saccade.cli import main
-from saccade.cli.timing import Call, Machine, by_turns, quartiles, works_of
+from saccade_lab.random_checkpoint.head import config_of_size, write_head
+from saccade_lab.timing import Call, Machine, by_turns, quartiles, works_of
 
 MACHINE = Machine("avx512", 1, {"float32": 1e9, "bfloat16": 2e9, "int8": 4e9}, 1e9)
 
