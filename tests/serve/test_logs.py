@@ -9,8 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from saccade.serve.logs import MOST_LINES, MOST_WARNINGS, JsonLog, LiveLog, TextLog, Writer
-from saccade.serve.statistics import Statistics, line
+from saccade.serve.logs import MOST_LINES, MOST_WARNINGS, JsonLog, LiveLog, Statistics, TextLog, Writer, line
 from tests.helpers.serve_cases import ask, get_action, requester, serving
 
 

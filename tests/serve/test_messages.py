@@ -17,10 +17,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from saccade.errors import DtypeError, InputError, SaccadeError, ShapeError
-from saccade.serve import pickles
 from saccade.serve.limits import Limits
 from saccade.serve.npy import from_npy, to_npy
-from saccade.serve.packing import MOST_ITEMS, pack, unpack
+from saccade.serve.packing import MOST_ITEMS, is_pickle, pack, refusal, unpack
 from tests.helpers.serve_cases import decoded, packed
 
 LIMITS = Limits()
@@ -294,16 +293,16 @@ def test_other_garbage_is_named(data: bytes, match: str) -> None:
 def test_pickles_are_recognised_and_answered_in_their_form() -> None:
     saved = io.BytesIO()
     torch.save({"endpoint": "ping"}, saved)
-    assert pickles.is_pickle(saved.getvalue())
+    assert is_pickle(saved.getvalue())
     # As the released client of N1 and early N1.5 reads its answers.
-    answer = torch.load(io.BytesIO(pickles.refusal(saved.getvalue())), weights_only=False)
+    answer = torch.load(io.BytesIO(refusal(saved.getvalue())), weights_only=False)
     assert "Isaac-GR00T N1.5 with pull request 329" in answer["error"]
     for protocol in range(2, 6):
         data = pickle.dumps({"endpoint": "ping"}, protocol)
-        assert pickles.is_pickle(data)
-        assert msgpack.unpackb(pickles.refusal(data)) == answer
-    assert not pickles.is_pickle(b"\x80")  # an empty map
-    assert not pickles.is_pickle(packed({"endpoint": "ping"}))
+        assert is_pickle(data)
+        assert msgpack.unpackb(refusal(data)) == answer
+    assert not is_pickle(b"\x80")  # an empty map
+    assert not is_pickle(packed({"endpoint": "ping"}))
 
 
 def test_a_class_in_a_pickle_is_not_made() -> None:
@@ -311,7 +310,7 @@ def test_a_class_in_a_pickle_is_not_made() -> None:
         def __reduce__(self) -> Any:
             return (pytest.fail, ("unpickled",))
 
-    assert pickles.is_pickle(pickle.dumps(Hostile.__reduce__(Hostile())))
+    assert is_pickle(pickle.dumps(Hostile.__reduce__(Hostile())))
 
 
 def test_npy_is_written_as_numpy_does() -> None:

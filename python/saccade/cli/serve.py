@@ -200,8 +200,8 @@ def make_log(form: str) -> Log:
     from saccade.serve import logs
 
     if form == "json":
-        return logs.JsonLog()
-    return logs.LiveLog() if sys.stderr.isatty() else logs.TextLog()
+        return logs.JsonLog(1)
+    return logs.LiveLog(2) if sys.stderr.isatty() else logs.TextLog(2)
 
 
 def limits_of(args: argparse.Namespace) -> Limits:

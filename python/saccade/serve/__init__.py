@@ -1,8 +1,8 @@
 """A server for robots that speak Isaac-GR00T's protocol, and a small client. Needs the extra `serve`.
 
-A request passes through these files: `transport` (ZeroMQ), `pickles` and `packing` with `npy` (bytes to
-values, within the `limits`), `requests` (values to calls), `batching` (which are computed together), `engine`
-with `sessions` (actions), and back. `server` joins them.
+A request passes through these files: `transport` (ZeroMQ), `packing` with `npy` (bytes to values,
+within the `limits`), `requests` (values to calls), `batching` (which are computed together), `engine` with
+`sessions` (actions), and back. `server` joins them.
 """
 
 from __future__ import annotations

@@ -18,39 +18,22 @@ ACTIVE_SECONDS = 1.0
 
 @dataclass(eq=False)
 class Job:
-    """A ``get_action`` request, from its arrival to its answer.
-
-    Attributes:
-        call: What it asks for.
-        parsed: Its observations.
-        client: Who asks.
-        frames: The frames before the request, which are sent back before the answer.
-        is_msgpack_numpy: In which form its arrays came, and those of the answer go.
-        num_bytes: Size of the request.
-        received: When it arrived, on the clock of `time.perf_counter`.
-        is_claimed: Whether a thread has begun to prepare it while it waits.
-        inputs: What the backbone takes, once it is prepared.
-        actions: The actions, once they are computed.
-        info: What is told besides them.
-        batch: Number of observations that were computed together.
-        error: Why there are no actions.
-        milliseconds: How long each part took.
-    """
+    """A ``get_action`` request, from its arrival to its answer."""
 
     call: Call
     parsed: ParsedObservation
     client: Any
-    frames: Sequence[bytes] = ()
-    is_msgpack_numpy: bool = False
+    frames: Sequence[bytes] = ()  # before the request, which are sent back before the answer
+    is_msgpack_numpy: bool = False  # the form in which its arrays came, and those of the answer go
     num_bytes: int = 0
     received: float = field(default_factory=time.perf_counter)
-    is_claimed: bool = False
-    inputs: Sequence[Any] = ()
+    is_claimed: bool = False  # a thread has begun to prepare it while it waits
+    inputs: Sequence[Any] = ()  # what the backbone takes, once it is prepared
     actions: Any = None
-    info: Mapping[str, Any] = field(default_factory=dict)
-    batch: int = 0
-    error: BaseException | None = None
-    milliseconds: dict[str, float] = field(default_factory=dict)
+    info: Mapping[str, Any] = field(default_factory=dict)  # what is told besides the actions
+    batch: int = 0  # number of observations that were computed together
+    error: BaseException | None = None  # why there are no actions
+    milliseconds: dict[str, float] = field(default_factory=dict)  # by part
 
     @property
     def rows(self) -> int:
@@ -98,9 +81,8 @@ class Queue:
         """Appends a request."""
         with self._changed:
             self._jobs.append(job)
-            now = self._clock()
             self._active.pop(job.client, None)
-            self._active[job.client] = now
+            self._active[job.client] = now = self._clock()
             while next(iter(self._active.values())) < now - ACTIVE_SECONDS:
                 self._active.popitem(last=False)
             self._changed.notify()

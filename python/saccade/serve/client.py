@@ -98,11 +98,8 @@ class Client:
         Raises:
             ServerError, TimeoutError: As :meth:`get_action`.
         """
-        request: dict[str, Any] = {"endpoint": endpoint}
-        if data is not None:
-            request["data"] = data
-        if self._api_token is not None:
-            request["api_token"] = self._api_token
+        fields = {"endpoint": endpoint, "data": data, "api_token": self._api_token}
+        request = {name: value for name, value in fields.items() if value is not None}
         answer = unpack(self.exchange(pack(request)), Limits()).value
         if isinstance(answer, dict) and "error" in answer:
             raise ServerError(str(answer["error"]))
@@ -116,11 +113,10 @@ class Client:
         """
         if self._socket is None:
             self._socket = self._context.socket(zmq.REQ)
-            self._socket.setsockopt(zmq.LINGER, 0)
+            self._socket.linger = 0
             if self._server_key is not None:
-                self._socket.setsockopt(zmq.CURVE_SERVERKEY, self._server_key)
-                self._socket.setsockopt(zmq.CURVE_PUBLICKEY, self._keys[0])
-                self._socket.setsockopt(zmq.CURVE_SECRETKEY, self._keys[1])
+                self._socket.curve_serverkey = self._server_key
+                self._socket.curve_publickey, self._socket.curve_secretkey = self._keys
             self._socket.connect(self._address)
         self._socket.send(message)
         if not self._socket.poll(int(1e3 * self._timeout)):

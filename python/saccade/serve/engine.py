@@ -53,21 +53,13 @@ class _Work:
 class Engine:
     """Computes batches.
 
-    Args:
-        policy: The policy.
-        sessions: The sessions, whose chunks it continues.
-        num_steps: Number of Euler steps of requests that do not say it, or None for that of the checkpoint.
-
     Attributes:
         num_workers: Number of threads that are to call :meth:`run` at the same time, at most.
     """
 
     def __init__(self, policy: Policy, sessions: Sessions, num_steps: int | None = None) -> None:
-        self._policy = policy
-        self._sessions = sessions
-        self._num_steps = num_steps
-        self._running = 0
-        self._lock = threading.Lock()
+        self._policy, self._sessions, self._num_steps = policy, sessions, num_steps
+        self._lock, self._running = threading.Lock(), 0
         if policy.backbone is None or policy.processor is None:
             raise InputError(f"policy: expected a whole policy, got one without a backbone: {policy!r}")
         self._backbone, self._processor = policy.backbone, policy.processor
@@ -88,24 +80,17 @@ class Engine:
         for job in jobs:
             waited = 1e3 * (time.perf_counter() - job.received)
             job.milliseconds["wait"] = waited - job.milliseconds.get("inputs", 0.0)
-        with self._running_threads() as running:
-            # A request that is computed alone has all threads.
-            alone = self.num_workers > 1 and (running > 1 or len(jobs) > 1)
-            with _saccade.stay_on_this_thread() if alone else nullcontext():
-                self._compute(jobs)
-        return jobs
-
-    @contextmanager
-    def _running_threads(self) -> Iterator[int]:
-        """The number of threads that compute, this one included."""
         with self._lock:
             self._running += 1
-            running = self._running
+            # A request that is computed alone has all threads.
+            alone = self.num_workers > 1 and (self._running > 1 or len(jobs) > 1)
         try:
-            yield running
+            with _saccade.stay_on_this_thread() if alone else nullcontext():
+                self._compute(jobs)
         finally:
             with self._lock:
                 self._running -= 1
+        return jobs
 
     def _compute(self, jobs: Sequence[Job]) -> None:
         works = []

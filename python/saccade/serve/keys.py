@@ -12,13 +12,7 @@ from saccade.errors import InputError
 
 @dataclass(frozen=True)
 class ServerKeys:
-    """The keys of an encrypted server.
-
-    Attributes:
-        secret: The server's secret key.
-        clients: The public keys of the clients that may connect, or None for any client that knows the
-            server's public key.
-    """
+    """The server's secret key, and the public keys of the clients that may connect (None: any client)."""
 
     secret: bytes
     clients: frozenset[bytes] | None = None
@@ -49,11 +43,7 @@ def read_server_keys(secret_key: str | Path, client_keys: str | Path | None = No
 
 
 def read_pair(path: str | Path) -> tuple[bytes, bytes]:
-    """The public and the secret key in a file ``NAME.key_secret``.
-
-    Raises:
-        InputError: The file is missing or contains no secret key.
-    """
+    """The public and the secret key in a file ``NAME.key_secret``."""
     public, secret = _read(path)
     if secret is None:
         raise InputError(f"{path}: expected a file with a secret key (*.key_secret), found a public key only")
@@ -61,11 +51,7 @@ def read_pair(path: str | Path) -> tuple[bytes, bytes]:
 
 
 def read_public(path: str | Path) -> bytes:
-    """The public key in a file ``NAME.key``.
-
-    Raises:
-        InputError: The file is missing or contains no key.
-    """
+    """The public key in a file ``NAME.key``."""
     return _read(path)[0]
 
 

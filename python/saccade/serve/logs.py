@@ -1,4 +1,4 @@
-"""The log of a server: lines for people, JSON lines for machines, or one live line on a terminal.
+"""What a server has done, and its log: lines for people, JSON lines for machines, or one live line.
 
 A thread of `logging` writes the lines, so a full disk or a reader that stalls does not hold up the server.
 Lines that cannot be written are counted.
@@ -11,13 +11,16 @@ import logging.handlers
 import os
 import queue
 import shutil
-import threading
 import time
+from collections import Counter, deque
+from collections.abc import Mapping
 from typing import Any, Protocol
+
+import numpy as np
 
 from saccade._internal.json import dumps
 from saccade.errors import printable
-from saccade.serve.statistics import line
+from saccade.serve.engine import PARTS
 
 #: Lines that wait to be written; more are lost, and counted.
 MOST_LINES = 10_000
@@ -25,9 +28,65 @@ MOST_LINES = 10_000
 MOST_WARNINGS = 20
 #: Back to the start of the line of a terminal, and erases it.
 ERASE = "\r\x1b[2K"
-#: Seconds between two statistics in a log, and on a terminal.
-STATISTICS_SECONDS = 10.0
-LIVE_SECONDS = 1.0
+#: Latencies are those of so many answers, the last ones.
+WINDOW = 1024
+
+
+class Statistics:
+    """Counts and latencies since the start; one thread uses it."""
+
+    def __init__(self) -> None:
+        self.requests: Counter[str] = Counter()  # by endpoint, or "unreadable"
+        self.errors = 0  # requests that did not get what they asked for
+        # By why nobody got the answer: "gone" and "late" were not computed, "unsent" were computed in vain.
+        self.dropped: Counter[str] = Counter()
+        self._started = time.monotonic()
+        self._computed: deque[tuple[float, int, Mapping[str, float]]] = deque(maxlen=WINDOW)
+
+    def count(self, endpoint: str, *, is_error: bool) -> None:
+        """Counts a request."""
+        self.requests[endpoint] += 1
+        self.errors += is_error
+
+    def computed(self, batch: int, milliseconds: Mapping[str, float]) -> None:
+        """Takes notice of actions, of which so many observations were computed together."""
+        self._computed.append((time.monotonic(), batch, milliseconds))
+
+    def summary(self) -> dict[str, Any]:
+        """Counts since the start; of the last actions the rate, the mean batch and the latency by part."""
+        now, batches = time.monotonic(), [batch for _, batch, _ in self._computed]
+        span = now - self._computed[0][0] if self._computed else 0.0
+        parts = {}
+        for part in (*PARTS, "total") if self._computed else ():
+            p50, p99 = np.percentile([took[part] for *_, took in self._computed], (50, 99))
+            parts[part] = {"p50": round(float(p50), 3), "p99": round(float(p99), 3)}
+        return {
+            "seconds": round(now - self._started, 3),
+            "requests": dict(self.requests),
+            "errors": self.errors,
+            "dropped": dict(self.dropped),
+            "per_second": round(len(self._computed) / span, 3) if span > 0 else 0.0,
+            "batch": round(float(np.mean(batches)), 2) if batches else 0.0,
+            "milliseconds": parts,
+        }
+
+
+def line(summary: dict[str, Any]) -> str:
+    """A summary on one line.
+
+    Example:
+        >>> line(Statistics().summary())
+        '0 requests, 0 errors'
+    """
+    text = f"{sum(summary['requests'].values())} requests, {summary['errors']} errors"
+    if summary["dropped"]:
+        text += f", {sum(summary['dropped'].values())} dropped"
+    parts = summary["milliseconds"]
+    if parts:
+        shown = ", ".join(f"{part} {value['p50']:.1f}/{value['p99']:.1f}" for part, value in parts.items())
+        speed = f"{summary['per_second']:.1f} a second in batches of {summary['batch']:.1f}"
+        text += f"; {speed}; ms p50/p99: {shown}"
+    return text
 
 
 class Log(Protocol):
@@ -49,27 +108,30 @@ class Log(Protocol):
         """Writes what waits, if that is possible."""
 
 
-class _Queued(logging.handlers.QueueHandler):
-    """Appends records to a queue, and never waits; those for which there is no room are counted."""
+class Writer(logging.handlers.QueueListener):
+    """Writes text to a file descriptor in a thread of its own, and does not close it.
 
-    lost = 0
+    It takes no lock, for which the end of the program would wait.
+    """
 
-    def enqueue(self, record: logging.LogRecord) -> None:
-        """See `QueueHandler`."""
-        try:
-            self.queue.put_nowait(record)
-        except queue.Full:
-            self.lost += 1
-
-
-class _Written(logging.handlers.QueueListener):
-    """Writes records to a file descriptor. It takes no lock, for which the end of the program would wait."""
-
-    lost = 0
-
-    def __init__(self, waiting: queue.Queue[Any], descriptor: int) -> None:
-        super().__init__(waiting)
+    def __init__(self, descriptor: int) -> None:
+        self._lines: queue.Queue[Any] = queue.Queue(MOST_LINES)
+        super().__init__(self._lines)
         self._descriptor = descriptor
+        self._not_queued = self._not_written = 0
+        self.start()
+
+    @property
+    def lost(self) -> int:
+        """Number of texts that were not written."""
+        return self._not_queued + self._not_written
+
+    def write(self, text: str) -> None:
+        """Appends text, with its line break; never waits."""
+        try:
+            self._lines.put_nowait(logging.makeLogRecord({"msg": text}))
+        except queue.Full:
+            self._not_queued += 1
 
     def handle(self, record: logging.LogRecord) -> None:
         """See `QueueListener`. A record that cannot be written is counted."""
@@ -78,117 +140,67 @@ class _Written(logging.handlers.QueueListener):
             while data:
                 data = data[os.write(self._descriptor, data) :]
         except OSError:  # a full disk, a closed pipe
-            self.lost += 1
-
-
-class Writer:
-    """Writes text to a file descriptor in a thread of its own.
-
-    Args:
-        descriptor: The file descriptor. It is not closed.
-    """
-
-    def __init__(self, descriptor: int) -> None:
-        self._waiting: queue.Queue[Any] = queue.Queue(MOST_LINES)
-        self._queued = _Queued(self._waiting)
-        self._written = _Written(self._waiting, descriptor)
-        self._logger = logging.Logger("saccade.serve")
-        self._logger.addHandler(self._queued)
-        self._written.start()
-
-    @property
-    def lost(self) -> int:
-        """Number of texts that were not written."""
-        return self._queued.lost + self._written.lost
-
-    def write(self, text: str) -> None:
-        """Appends text, with its line break; never waits."""
-        self._logger.info("%s", text)
+            self._not_written += 1
 
     def close(self, seconds: float = 2.0) -> None:
         """Writes what waits, for at most the given number of seconds."""
-
-        def end() -> None:
-            self._waiting.join()
-            self._written.stop()
-
-        ending = threading.Thread(target=end, daemon=True)
-        ending.start()
-        ending.join(seconds)
+        end = time.monotonic() + seconds
+        while self._lines.unfinished_tasks and time.monotonic() < end:
+            time.sleep(0.005)
+        if not self._lines.unfinished_tasks:
+            self.stop()
+        self._descriptor = -1  # another file may have the number from now on
 
 
-class _Lines:
-    """What all logs do: write to a file descriptor, and limit the number of warnings a second."""
+class _Lines(Writer):
+    """Limits the number of warnings a second."""
 
-    every = STATISTICS_SECONDS
+    every = 10.0
 
     def __init__(self, descriptor: int) -> None:
-        self._writer = Writer(descriptor)
-        self._second, self._passed, self._held = 0, 0, 0
+        super().__init__(descriptor)
+        self._second, self._warnings, self._left_out = 0, 0, 0
 
-    def close(self) -> None:
-        """See :class:`Log`."""
-        self._writer.close()
+    def event(self, name: str, **fields: Any) -> None:
+        """See :class:`Log`. The next warning that is written says how many were not."""
+        if name == "warning":
+            now = int(time.monotonic())
+            if now != self._second:
+                self._second, self._warnings = now, 0
+            if self._warnings >= MOST_WARNINGS:
+                self._left_out += 1
+                return
+            self._warnings += 1
+            if self._left_out:
+                fields["left_out"], self._left_out = self._left_out, 0
+        self._event(name, fields)
 
-    def _left_out(self) -> int | None:
-        """The number of warnings that were not written before this one, or None if this is not either."""
-        now = int(time.monotonic())
-        if now != self._second:
-            self._second, self._passed = now, 0
-        if self._passed >= MOST_WARNINGS:
-            self._held += 1
-            return None
-        self._passed += 1
-        held, self._held = self._held, 0
-        return held
+    def _event(self, name: str, fields: dict[str, Any]) -> None:
+        raise NotImplementedError
 
 
 class JsonLog(_Lines):
-    """JSON lines on standard output: an object with ``event`` and ``time`` (seconds since 1970) each.
+    """JSON lines: an object with ``event`` and ``time`` (seconds since 1970) each.
 
     Events: ``listening``, ``request``, ``statistics``, ``warning``, ``stopping``, ``stopped``.
     """
 
-    def __init__(self, descriptor: int = 1) -> None:
-        super().__init__(descriptor)
-
-    def event(self, name: str, **fields: Any) -> None:
-        """See :class:`Log`."""
-        if name == "warning":
-            if (held := self._left_out()) is None:
-                return
-            fields |= {"left_out": held} if held else {}
-        self._write(name, fields)
-
     def request(self, **fields: Any) -> None:
         """See :class:`Log`."""
-        self._write("request", fields)
+        self._event("request", fields)
 
     def statistics(self, summary: dict[str, Any]) -> None:
         """See :class:`Log`."""
-        self._write("statistics", {**summary, "lost_lines": self._writer.lost})
+        self._event("statistics", {**summary, "lost_lines": self.lost})
 
-    def _write(self, name: str, fields: dict[str, Any]) -> None:
-        self._writer.write(
-            dumps({"event": name, "time": round(time.time(), 6), **fields}, default=str) + "\n"
-        )
+    def _event(self, name: str, fields: dict[str, Any]) -> None:
+        self.write(dumps({"event": name, "time": round(time.time(), 6), **fields}, default=str) + "\n")
 
 
 class TextLog(_Lines):
-    """Lines on standard error: what happens, errors, and statistics where there are new requests."""
+    """Lines for people: what happens, errors, and statistics where there are new requests."""
 
-    def __init__(self, descriptor: int = 2) -> None:
-        super().__init__(descriptor)
-        self._last = ""
-
-    def event(self, name: str, **fields: Any) -> None:
-        """See :class:`Log`."""
-        text = _described(name, fields)
-        if name == "warning":
-            if (held := self._left_out()) is None:
-                return
-            text += f" (and {held} more)" if held else ""
-        self._line(text)
+    _last = ""  # of the statistics
 
     def request(self, **fields: Any) -> None:
         """See :class:`Log`. Only errors are written."""
@@ -198,42 +210,44 @@ class TextLog(_Lines):
     def statistics(self, summary: dict[str, Any]) -> None:
         """See :class:`Log`."""
         text = line(summary)
-        if summary["requests"] and (text.partition(";")[0] != self._last.partition(";")[0]):
+        if summary["requests"] and text.partition(";")[0] != self._last.partition(";")[0]:
             self._line(text)
         self._last = text
 
+    def _event(self, name: str, fields: dict[str, Any]) -> None:
+        if name == "warning":
+            text = f"{fields['client']}: " if fields.get("client") else ""
+            text += str(fields["message"])
+            text += f" (and {fields['left_out']} more)" if "left_out" in fields else ""
+        elif name == "listening":
+            text = f"listening on {fields['address']} ({fields['policy']})"
+        else:
+            details = ", ".join(f"{key} {value}" for key, value in fields.items())
+            text = f"{name}: {details}" if details else name
+        self._line(text)
+
     def _line(self, text: str) -> None:
-        self._writer.write(f"saccade serve: {printable(text)}\n")
+        self.write(f"saccade serve: {printable(text)}\n")
 
 
 class LiveLog(TextLog):
     """On a terminal: the lines of :class:`TextLog`, with one live line of statistics below them."""
 
-    every = LIVE_SECONDS
+    every = 1.0
 
     def statistics(self, summary: dict[str, Any]) -> None:
         """See :class:`Log`."""
         self._last = line(summary)
-        self._writer.write(ERASE + self._shown())
+        self.write(ERASE + self._shown())
 
-    def close(self) -> None:
+    def close(self, seconds: float = 2.0) -> None:
         """See :class:`Log`."""
-        self._writer.write("\n")
-        super().close()
+        self.write("\n")
+        super().close(seconds)
 
     def _line(self, text: str) -> None:
-        self._writer.write(f"{ERASE}saccade serve: {printable(text)}\n{self._shown()}")
+        self.write(f"{ERASE}saccade serve: {printable(text)}\n{self._shown()}")
 
     def _shown(self) -> str:
         """The live line, as wide as the terminal at most."""
         return self._last[: shutil.get_terminal_size().columns - 1]
-
-
-def _described(name: str, fields: dict[str, Any]) -> str:
-    if name == "warning":
-        client = fields.get("client")
-        return f"{client}: {fields['message']}" if client else str(fields["message"])
-    if name == "listening":
-        return f"listening on {fields['address']} ({fields['policy']})"
-    details = ", ".join(f"{key} {value}" for key, value in fields.items())
-    return f"{name}{f': {details}' if details else ''}"

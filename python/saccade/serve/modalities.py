@@ -6,7 +6,6 @@ prefixed keys (``video.front``), N1.6 and N1.7 want a map with plain keys.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from saccade._internal import hub
@@ -19,46 +18,33 @@ from saccade.robots.reading import processor_folder
 if TYPE_CHECKING:
     from saccade.policy.policy import Policy
 
-#: The forms of the answer: that of N1.5, and that of N1.6 and later.
-FORMS = ("text", "map")
 MODALITIES = ("video", "state", "action", "language")
 
 Configs = dict[str, dict[str, Any]]
 
 
 def form_of(version: str) -> str:
-    """The form that the released clients of a version read.
-
-    Args:
-        version: As in :class:`saccade.HeadConfig`.
-    """
+    """The form that the released clients of a version of :class:`saccade.HeadConfig` read."""
     return "text" if version in ("n1", "n1.5") else "map"
 
 
 def answers(policy: Policy) -> dict[str, Any]:
-    """The answer in each of the `FORMS`.
+    """The answer in both forms: as ``"text"`` for N1.5, and as ``"map"`` for N1.6 and later.
 
     Raises:
         CheckpointError: A file of the checkpoint is damaged.
     """
-    configs = _of_checkpoint(policy) or _of_policy(policy)
-    return {
-        "text": {name: _wrapped(dumps(_prefixed(name, config))) for name, config in configs.items()},
-        "map": {name: _wrapped(config) for name, config in configs.items()},
-    }
-
-
-def _wrapped(config: Any) -> dict[str, Any]:
     # N1.5's and N1.6's clients know the first mark, N1.7's the second.
-    return {"__ModalityConfig_class__": True, "__ModalityConfig__": True, "as_json": config}
-
-
-def _prefixed(modality: str, config: Mapping[str, Any]) -> dict[str, Any]:
-    """As N1.5's class has it: two fields, and keys with the modality, which those of words have."""
-    keys = config["modality_keys"]
-    if modality != "language":
-        keys = [f"{modality}.{key}" for key in keys]
-    return {"delta_indices": config["delta_indices"], "modality_keys": keys}
+    marks = {"__ModalityConfig_class__": True, "__ModalityConfig__": True}
+    forms: dict[str, Any] = {"text": {}, "map": {}}
+    for name, config in (_of_checkpoint(policy) or _of_policy(policy)).items():
+        # N1.5's class has two fields, and keys with the modality, which those of words have already.
+        prefix = "" if name == "language" else f"{name}."
+        keys = [prefix + key for key in config["modality_keys"]]
+        text = dumps({"delta_indices": config["delta_indices"], "modality_keys": keys})
+        forms["text"][name] = {**marks, "as_json": text}
+        forms["map"][name] = {**marks, "as_json": config}
+    return forms
 
 
 def _of_checkpoint(policy: Policy) -> Configs | None:
@@ -76,11 +62,11 @@ def _of_checkpoint(policy: Policy) -> Configs | None:
         robot = values["processor_kwargs"]["modality_configs"][embodiment]
         found = {name: dict(robot[name]) for name in MODALITIES if name in robot}
         for config in found.values():
-            _check(config["delta_indices"], int)
-            _check(config["modality_keys"], str)
+            for field, kind in (("delta_indices", int), ("modality_keys", str)):
+                given = config[field]
+                if not isinstance(given, list) or not all(type(value) is kind for value in given):
+                    raise ValueError(f"expected a list of {kind.__name__}, got {given!r:.100}")
     except (AttributeError, KeyError, TypeError, ValueError) as error:
-        if isinstance(error, CheckpointError):
-            raise
         raise CheckpointError(f"{path}: modality_configs of an unknown form ({error!r})") from error
     return found
 
@@ -107,8 +93,3 @@ def _of_policy(policy: Policy) -> Configs:
         for name in MODALITIES
         if keys[name]
     }
-
-
-def _check(values: Any, kind: type) -> None:
-    if not isinstance(values, list) or not all(type(value) is kind for value in values):
-        raise ValueError(f"expected a list of {kind.__name__}, got {values!r:.100}")

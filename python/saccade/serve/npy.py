@@ -16,10 +16,7 @@ from saccade.errors import DtypeError, InputError, ShapeError
 
 #: A header of numbers with as many axes as NumPy has is shorter. It is parsed as a Python literal.
 LONGEST_HEADER = 1024
-HEADERS = {
-    (1, 0): npy_format.read_array_header_1_0,
-    (2, 0): npy_format.read_array_header_2_0,
-}
+HEADERS = {(1, 0): npy_format.read_array_header_1_0, (2, 0): npy_format.read_array_header_2_0}
 MOST_AXES = 32
 #: Kinds of dtypes: booleans, integers, floating point numbers and text.
 KINDS = "biufU"
@@ -39,10 +36,6 @@ def to_npy(array: npt.NDArray[Any]) -> bytes:
 
 def from_npy(data: Any, most_elements: int) -> npt.NDArray[Any]:
     """The array in the bytes of a ``.npy`` file; it shares their memory.
-
-    Args:
-        data: The bytes.
-        most_elements: A larger array is refused.
 
     Raises:
         InputError: This is no ``.npy`` file, or its array is too large.
@@ -70,34 +63,23 @@ def from_npy(data: Any, most_elements: int) -> npt.NDArray[Any]:
 
 def to_msgpack_numpy(array: npt.NDArray[Any]) -> dict[bytes, Any]:
     """The map of the package msgpack-numpy for an array."""
-    return {
-        b"nd": True,
-        b"type": array.dtype.str,
-        b"kind": b"",
-        b"shape": array.shape,
-        b"data": array.tobytes(),
-    }
+    layout = {b"nd": True, b"type": array.dtype.str, b"kind": b"", b"shape": array.shape}
+    return {**layout, b"data": array.tobytes()}
 
 
 def from_msgpack_numpy(fields: Mapping[Any, Any], most_elements: int) -> Any:
-    """The array or number in a map of the package msgpack-numpy, which N1.7 clients send.
-
-    Args:
-        fields: The map, with ``nd``, ``type``, ``kind``, ``shape`` and ``data`` as text or bytes.
-        most_elements: A larger array is refused.
+    """The array or number in a map of the package msgpack-numpy, whose keys are text or bytes.
 
     Raises:
         InputError, DtypeError, ShapeError: As :func:`from_npy`.
     """
-
-    def field(name: str) -> Any:
-        return fields.get(name.encode(), fields.get(name))
-
-    kind, given = field("kind"), field("type")
-    name = given.decode("ascii", "replace") if isinstance(given, bytes) else given
+    names = ("nd", "type", "kind", "shape", "data")
+    is_array, name, kind, shape, data = (fields.get(name.encode(), fields.get(name)) for name in names)
+    if isinstance(name, bytes):
+        name = name.decode("ascii", "replace")
     if kind in (b"O", "O") or name in ("O", "|O"):
         raise DtypeError(f"array: expected numbers, booleans or text, got objects: {PICKLES}")
-    data, shape = field("data"), field("shape") if field("nd") else []
+    shape = shape if is_array else []
     if not isinstance(name, str) or not isinstance(data, bytes) or kind not in (None, b"", ""):
         raise DtypeError("array: expected numbers, booleans or text, got another msgpack-numpy value")
     if not isinstance(shape, list) or not all(type(size) is int for size in shape):
@@ -109,7 +91,7 @@ def from_msgpack_numpy(fields: Mapping[Any, Any], most_elements: int) -> Any:
     except (TypeError, ValueError):
         raise DtypeError(f"array: expected numbers, booleans or text, got {name!r:.100}") from None
     array = _array(memoryview(data), dtype, tuple(shape), most_elements)
-    return array if field("nd") else array[()]
+    return array if is_array else array[()]
 
 
 def _array(

@@ -1,10 +1,11 @@
-"""Messages: msgpack with arrays, within limits."""
+"""Messages: msgpack with arrays, within limits. Pickles of old clients are never loaded, and answered."""
 
 from __future__ import annotations
 
-import functools
-from dataclasses import dataclass
-from typing import Any
+import io
+import pickle
+import zipfile
+from typing import Any, NamedTuple
 
 import msgpack
 import numpy as np
@@ -16,33 +17,36 @@ from saccade.serve.npy import Bytes, from_msgpack_numpy, from_npy, to_msgpack_nu
 #: Items of one list or map.
 MOST_ITEMS = 4096
 NDARRAY = "__ndarray_class__"
+#: How `torch.save` begins, which the clients of N1 and early N1.5 use: a zip file.
+TORCH = b"PK\x03\x04"
+
+REFUSAL = (
+    "message: expected msgpack, got a pickle, which is never loaded: this client is of GR00T N1, or of N1.5 "
+    "before 26 August 2025. Update it to Isaac-GR00T N1.5 with pull request 329 or later, N1.6 or N1.7"
+)
 
 
-@dataclass(frozen=True, eq=False)
-class Message:
-    """An unpacked message.
-
-    Attributes:
-        value: What it contains.
-        is_msgpack_numpy: Whether it has arrays in the form of the package msgpack-numpy.
-    """
+class Message(NamedTuple):
+    """An unpacked message, and whether it has arrays in the form of the package msgpack-numpy."""
 
     value: Any
     is_msgpack_numpy: bool
 
 
 def pack(value: Any, *, as_msgpack_numpy: bool = False) -> bytes:
-    """A message of dicts, lists, text, numbers and arrays.
-
-    Args:
-        value: What it contains.
-        as_msgpack_numpy: Whether arrays are maps of the package msgpack-numpy, instead of bytes of a ``.npy``
-            file.
+    """A message of dicts, lists, text, numbers and arrays, which go as ``.npy`` files or as msgpack-numpy's.
 
     Raises:
         TypeError: It contains anything else.
     """
-    plain = functools.partial(_plain, as_msgpack_numpy=as_msgpack_numpy)
+
+    def plain(value: Any) -> Any:
+        if isinstance(value, np.ndarray):
+            return to_msgpack_numpy(value) if as_msgpack_numpy else {NDARRAY: True, "as_npy": to_npy(value)}
+        if isinstance(value, np.generic):
+            return value.item()
+        raise TypeError(f"message: cannot contain {type(value).__name__}")
+
     packed: bytes = msgpack.packb(value, default=plain)
     return packed
 
@@ -53,10 +57,6 @@ def unpack(data: Bytes, limits: Limits) -> Message:
     msgpack bounds every list and map to `MOST_ITEMS` before it is built, and refuses extensions and a nesting
     deeper than its own stack (1024). It does not bound the number of values: lists and maps are counted as
     they are completed, because one byte of a message can become a list of 70.
-
-    Args:
-        data: The message.
-        limits: See there.
 
     Raises:
         InputError, DtypeError, ShapeError: This is not msgpack, is beyond a limit, or contains anything but
@@ -111,11 +111,28 @@ def _refuse_extension(code: int, data: bytes) -> Any:
     raise InputError(f"message: expected no msgpack extension, got type {code}")
 
 
-def _plain(value: Any, as_msgpack_numpy: bool) -> Any:
-    if isinstance(value, np.ndarray):
-        if as_msgpack_numpy:
-            return to_msgpack_numpy(value)
-        return {NDARRAY: True, "as_npy": to_npy(value)}
-    if isinstance(value, np.generic):
-        return value.item()
-    raise TypeError(f"message: cannot contain {type(value).__name__}")
+def is_pickle(data: Bytes) -> bool:
+    """Whether a message is a pickle of any protocol from 2 on, or a file of ``torch.save``.
+
+    Example:
+        >>> is_pickle(pickle.dumps({"endpoint": "ping"})), is_pickle(pack({"endpoint": "ping"}))
+        (True, False)
+    """
+    start = bytes(memoryview(data)[:4])
+    # As msgpack, a pickle would be an empty map with bytes after it.
+    return start == TORCH or (len(data) > 2 and start[0] == 0x80 and 2 <= start[1] <= 5)
+
+
+def refusal(data: Bytes) -> bytes:
+    """The error for a client that sent a pickle, in a form that it can read.
+
+    A client that uses ``torch.save`` gets what ``torch.load`` reads, so that its user sees the message.
+    """
+    error = {"error": REFUSAL}
+    if bytes(memoryview(data)[:4]) != TORCH:
+        return pack(error)
+    output = io.BytesIO()
+    with zipfile.ZipFile(output, "w", zipfile.ZIP_STORED) as archive:
+        archive.writestr("archive/data.pkl", pickle.dumps(error, protocol=2))
+        archive.writestr("archive/version", "3\n")
+    return output.getvalue()

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import hmac
+import itertools
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -35,57 +36,33 @@ MOST_IGNORED = 8
 
 @dataclass(frozen=True)
 class Options:
-    """How the actions of a request are sampled.
-
-    Attributes:
-        seed: Seed of the noise, or None for noise that is different each time.
-        num_steps: Number of Euler steps, or None for the server's.
-        session: The id of the session whose last chunk is continued, or None.
-        executed: Number of actions of the session's last chunk that the robot has executed when the
-            observation was taken, or None if it was not said.
-        frozen: Number of further actions that it executes before the answer arrives. They do not change.
-        ramp_rate: See :class:`saccade.Chunking`.
-        chunking: How the last chunk is continued, if it was said in the released names: these count its rows
-            to ``horizon``, and not to its end.
-        stated: The options of the request that are read, by name.
-        ignored: Names of those that are not: unknown ones, and released ones that need a session.
-    """
+    """How the actions of a request are sampled."""
 
     seed: int | None = None
     num_steps: int | None = None
     session: str | int | None = None
+    #: Number of actions of the session's last chunk that the robot has executed at the observation, if said.
     executed: int | None = None
     frozen: int = 0
     ramp_rate: float = 6.0
+    #: The same in the released names, which count the last chunk's actions to ``horizon``, not to its end.
     chunking: Chunking | None = None
-    stated: Mapping[str, Any] = field(default_factory=dict)
-    ignored: tuple[str, ...] = ()
+    stated: Mapping[str, Any] = field(default_factory=dict)  # the options that are read
+    ignored: tuple[str, ...] = ()  # the others: unknown ones, and released ones that need a session
 
 
 @dataclass(frozen=True, eq=False)
 class Call:
-    """What a request asks for.
-
-    Attributes:
-        endpoint: One of `ENDPOINTS`.
-        is_bare: Whether `data` is the observation itself, as N1.5's clients send it.
-        observation: The observation of ``get_action``, else empty.
-        options: The options of ``get_action`` and ``reset``.
-    """
+    """What a request asks for."""
 
     endpoint: str
-    is_bare: bool = False
+    is_bare: bool = False  # `data` is the observation itself, as N1.5's clients send it
     observation: Mapping[str, Any] = field(default_factory=dict)
     options: Options = Options()
 
 
 def parse(value: Any, num_timestep_buckets: int, seed: int | None = None) -> Call:
-    """What a request asks for.
-
-    Args:
-        value: The unpacked message.
-        num_timestep_buckets: Euler steps of a chunk at most.
-        seed: The seed of a request that brings none.
+    """What an unpacked message asks for; the seed is that of a request that brings none.
 
     Raises:
         InputError: It is no request, or an option is out of range.
@@ -120,11 +97,7 @@ def parse(value: Any, num_timestep_buckets: int, seed: int | None = None) -> Cal
 
 
 def check_num_steps(name: str, value: int, num_timestep_buckets: int) -> int:
-    """A number of Euler steps.
-
-    Raises:
-        InputError: It is not from 1 to ``num_timestep_buckets``.
-    """
+    """A number of Euler steps, which is from 1 to ``num_timestep_buckets``."""
     number = integer(name, value)
     if number > num_timestep_buckets:
         raise InputError(
@@ -143,13 +116,12 @@ def is_allowed(value: Any, secret: str | None) -> bool:
     if secret is None:
         return True
     given = value.get("api_token") if isinstance(value, dict) else None
-    is_same = hmac.compare_digest(_digest(given if isinstance(given, str) else ""), _digest(secret))
-    return is_same and isinstance(given, str)
-
-
-def _digest(text: str) -> bytes:
     # Digests are of one length, so the length of the secret does not show either.
-    return hashlib.sha256(text.encode("utf-8", "surrogatepass")).digest()
+    both = (
+        hashlib.sha256(text.encode("utf-8", "surrogatepass")).digest()
+        for text in (given if isinstance(given, str) else "", secret)
+    )
+    return hmac.compare_digest(*both) and isinstance(given, str)
 
 
 def _options(given: Any, num_timestep_buckets: int) -> Options:
@@ -174,35 +146,24 @@ def _options(given: Any, num_timestep_buckets: int) -> Options:
         if name == "num_steps":
             read[name] = check_num_steps(f"options: {name}", value, num_timestep_buckets)
         elif name in ("ramp_rate", "rtc_ramp_rate"):
-            read[name] = _rate(name, value)
+            if type(value) not in (int, float) or not math.isfinite(value) or value <= 0:
+                raise InputError(f"options: {name}: expected a finite number above 0, got {value!r:.100}")
+            read[name] = float(value)
         else:
             read[name] = integer(f"options: {name}", value, least=0)
     ignored = [str(key)[:LONGEST_SESSION] for key in given if key not in OPTIONS or key in unread]
+    own = {name: read[name] for name in ("seed", "num_steps", *CHUNKING) if name in read}
     return Options(
-        seed=read.get("seed"),
-        num_steps=read.get("num_steps"),
+        **own,
         session=session,
-        executed=read.get("executed"),
-        frozen=read.get("frozen", 0),
-        ramp_rate=read.get("ramp_rate", 6.0),
         chunking=_released(read),
         stated=read if session is None else {"session": session, **read},
         ignored=tuple(ignored[:MOST_IGNORED]),
     )
 
 
-def _rate(name: str, value: Any) -> float:
-    if type(value) in (int, float) and math.isfinite(value) and value > 0:
-        return float(value)
-    raise InputError(f"options: {name}: expected a finite number above 0, got {value!r:.100}")
-
-
 def _released(read: Mapping[str, Any]) -> Chunking | None:
-    """Real-time chunking in the released names; None if it was not asked for by them.
-
-    Raises:
-        InputError: They are incomplete, mixed with saccade's own, or contradict each other.
-    """
+    """Real-time chunking in the released names; None if it was not asked for by them."""
     given = [name for name in RELEASED_CHUNKING if name in read]
     if not given:
         return None
@@ -219,12 +180,9 @@ def _released(read: Mapping[str, Any]) -> Chunking | None:
             f"{', '.join(given)} without {', '.join(missing)}"
         )
     horizon, overlap, frozen, ramp_rate = (read[name] for name in RELEASED_CHUNKING)
-    for name, value, limit, most in (
-        ("rtc_overlap_steps", overlap, "action_horizon", horizon),
-        ("rtc_frozen_steps", frozen, "rtc_overlap_steps", overlap),
-    ):
-        if value > most:
-            raise InputError(f"options: {name}: expected at most {most} ({limit}), got {value}")
+    for limit, name in itertools.pairwise(RELEASED_CHUNKING[:3]):
+        if read[name] > read[limit]:
+            raise InputError(f"options: {name}: expected at most {read[limit]} ({limit}), got {read[name]}")
     if horizon < 1:
         raise InputError(f"options: action_horizon: expected at least 1, got {horizon}")
     return Chunking(overlap, frozen, ramp_rate, horizon)

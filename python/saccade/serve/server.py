@@ -15,16 +15,15 @@ from typing import TYPE_CHECKING, Any
 import saccade.observations as observations
 from saccade._internal import hub
 from saccade.errors import InputError, SaccadeError, printable
-from saccade.serve import modalities, pickles
+from saccade.serve import modalities
 from saccade.serve.batching import Job, Queue
 from saccade.serve.engine import Engine
 from saccade.serve.keys import ServerKeys
 from saccade.serve.limits import Limits
-from saccade.serve.logs import Log
-from saccade.serve.packing import pack, unpack
+from saccade.serve.logs import Log, Statistics
+from saccade.serve.packing import REFUSAL, is_pickle, pack, refusal, unpack
 from saccade.serve.requests import PING, UNAUTHORIZED, Call, check_num_steps, is_allowed, parse
 from saccade.serve.sessions import Sessions
-from saccade.serve.statistics import Statistics
 from saccade.serve.transport import Peer, Transport, address_of
 
 if TYPE_CHECKING:
@@ -37,12 +36,7 @@ WATCH_SECONDS = 5.0
 
 
 class Dropped(SaccadeError):
-    """A request that is not computed.
-
-    Args:
-        why: Key of the statistics: ``"gone"`` or ``"late"``.
-        message: The same for people.
-    """
+    """A request that is not computed, since its client is ``"gone"`` or it is ``"late"``."""
 
     def __init__(self, why: str, message: str) -> None:
         super().__init__(message)
@@ -106,13 +100,12 @@ class Server:
         self._queue = Queue(max_batch, max_wait_ms / 1e3, self._engine.prepare, self.num_workers)
         self._statistics = Statistics()
         self.address = address_of(listener)
+        self._unanswered: set[Job] = set()
         self._finished: deque[tuple[Job, bytes]] = deque()
-        self._unanswered = self._unanswered_bytes = 0
         self._stopping: str | None = None
-        self._is_draining = False
         source = policy.head.source
         self._folder = None if source is None else hub.resolve(source)
-        self._watched = _stamps(self._folder)
+        self._stamps = _stamps(self._folder)
         self._workers = [
             threading.Thread(target=self._compute, name=f"saccade-serve-{number}", daemon=True)
             for number in range(self.num_workers)
@@ -151,36 +144,33 @@ class Server:
         self._log.event("listening", address=self.address, policy=repr(self._policy), pid=os.getpid())
         for worker in self._workers:
             worker.start()
-        spoken = watched = time.monotonic()
+        self._spoken = self._watched = time.monotonic()
         try:
-            while not self._is_done():
-                for request in self._transport.requests(0.05 if self._stopping else 0.5):
-                    self._on_request(*request)
-                self._send_finished()
-                now = time.monotonic()
-                if now - spoken >= self._log.every:
-                    spoken = now
-                    self._log.statistics(self._statistics.summary())
-                if now - watched >= WATCH_SECONDS:
-                    watched = now
-                    self._watch()
+            while self._stopping is None:
+                self._turn(0.5)
+            self._log.event("stopping", reason=self._stopping, unanswered=len(self._unanswered))
+            self._queue.close()
+            while self._unanswered:
+                self._turn(0.05)
         finally:
             self._queue.close()
             self._transport.close()
         self._log.statistics(self._statistics.summary())
-        assert self._stopping is not None
         self._log.event("stopped", requests=self._statistics.requests.total(), errors=self._statistics.errors)
         return self._stopping
 
-    def _is_done(self) -> bool:
-        """Whether everything that was accepted is answered, once the server is to stop."""
-        if self._stopping is None:
-            return False
-        if not self._is_draining:
-            self._is_draining = True
-            self._log.event("stopping", reason=self._stopping, unanswered=self._unanswered)
-            self._queue.close()
-        return not self._unanswered
+    def _turn(self, seconds: float) -> None:
+        """Reads requests, waiting for at most so long, sends answers, and does what is due."""
+        for request in self._transport.requests(seconds):
+            self._on_request(*request)
+        self._send_finished()
+        now = time.monotonic()
+        if now - self._spoken >= self._log.every:
+            self._spoken = now
+            self._log.statistics(self._statistics.summary())
+        if now - self._watched >= WATCH_SECONDS:
+            self._watched = now
+            self._watch()
 
     def _on_request(self, client: Peer, frames: list[bytes], payload: memoryview) -> None:
         """Answers a request at once, or appends it to the queue."""
@@ -192,8 +182,8 @@ class Server:
                     "socket: expected no routing id of its own, since an answer could reach another client "
                     "with the same one"
                 )
-            if pickles.is_pickle(payload):
-                error, answer = pickles.REFUSAL, pickles.refusal(payload)
+            if is_pickle(payload):
+                error, answer = REFUSAL, refusal(payload)
             else:
                 message = unpack(payload, self._limits)
                 if not is_allowed(message.value, self._api_token):
@@ -201,12 +191,11 @@ class Server:
                 call = parse(message.value, self._most_steps, self._seed)
                 endpoint = call.endpoint
                 if endpoint == "get_action":
-                    parsed = self._read(call, len(payload))
+                    parsed, form = self._read(call, len(payload)), message.is_msgpack_numpy
+                    job = Job(call, parsed, client, frames, form, len(payload), received)
                     client.modality_form = "text" if call.is_bare else "map"
-                    self._unanswered += 1
-                    self._unanswered_bytes += len(payload)
-                    form = message.is_msgpack_numpy
-                    self._queue.put(Job(call, parsed, client, frames, form, len(payload), received))
+                    self._unanswered.add(job)
+                    self._queue.put(job)
                     return
                 answer = pack(self._answer(client, call))
         except Exception as caught:
@@ -235,10 +224,10 @@ class Server:
             raise InputError("the server is stopping, and takes no more requests")
         if len(self._queue) >= self._limits.waiting:
             raise InputError(f"busy: {self._limits.waiting} requests wait; try again")
-        if self._unanswered_bytes + num_bytes > self._limits.waiting_bytes:
+        waiting = sum(job.num_bytes for job in self._unanswered)
+        if waiting + num_bytes > self._limits.waiting_bytes:
             raise InputError(
-                f"busy: {self._unanswered_bytes} bytes of requests wait, and {num_bytes} more are too many; "
-                "try again"
+                f"busy: {waiting} bytes of requests wait, and {num_bytes} more are too many; try again"
             )
         return observations.read(call.observation, self._policy.requirements, self._limits.rows)
 
@@ -257,14 +246,11 @@ class Server:
         """Why a request is not computed, if nobody waits for its answer any more."""
         if not job.client.connection.is_open:
             return Dropped("gone", "dropped: its client is gone")
-        waited = time.perf_counter() - job.received
-        if waited > self._limits.request_seconds:
-            return Dropped(
-                "late",
-                f"dropped: it waited {waited:.1f} s, more than the {self._limits.request_seconds:g} s of "
-                "--request-seconds",
-            )
-        return None
+        waited, most = time.perf_counter() - job.received, self._limits.request_seconds
+        if waited <= most:
+            return None
+        message = f"dropped: it waited {waited:.1f} s, more than the {most:g} s of --request-seconds"
+        return Dropped("late", message)
 
     def _packed(self, job: Job) -> bytes:
         """The answer of a request that was computed or dropped."""
@@ -282,8 +268,7 @@ class Server:
         while self._finished:
             job, payload = self._finished.popleft()
             is_sent = self._transport.send(job.client, job.frames, payload)
-            self._unanswered -= 1
-            self._unanswered_bytes -= job.num_bytes
+            self._unanswered.remove(job)
             error = None if job.error is None else describe(job.error)
             milliseconds = {**job.milliseconds, "total": 1e3 * (time.perf_counter() - job.received)}
             batch = job.batch if error is None else 0
@@ -306,14 +291,13 @@ class Server:
 
     def _watch(self) -> None:
         """Says once if the checkpoint was replaced; the policy is in memory."""
-        stamps = _stamps(self._folder)
-        if stamps != self._watched:
-            self._watched = stamps
-            self._log.event(
-                "warning",
-                message=f"{self._policy.head.source}: the checkpoint has changed; this server keeps what it "
-                "loaded. Restart it to serve the new one",
+        before, self._stamps = self._stamps, _stamps(self._folder)
+        if self._stamps != before:
+            message = (
+                f"{self._policy.head.source}: the checkpoint has changed; this server keeps what it loaded. "
+                "Restart it to serve the new one"
             )
+            self._log.event("warning", message=message)
 
 
 def describe(error: BaseException) -> str:
@@ -324,15 +308,13 @@ def describe(error: BaseException) -> str:
     return printable("; ".join(line.strip() for line in text.splitlines()))[:LONGEST_ERROR]
 
 
-def _stamps(path: Path | None) -> tuple[Any, ...]:
+def _stamps(path: Path | None) -> list[Any]:
     """What changes if the files of a checkpoint do."""
     if path is None:
-        return ()
-    found: list[Any] = []
+        return []
     try:
-        for file in sorted(path.iterdir()) if path.is_dir() else [path]:
-            stat = file.stat()
-            found.append((file.name, stat.st_ino, stat.st_size, stat.st_mtime_ns))
+        files = sorted(path.iterdir()) if path.is_dir() else [path]
+        stats = [(file.name, file.stat()) for file in files]
     except OSError as error:
-        found.append(error.errno)
-    return tuple(found)
+        return [error.errno]
+    return [(name, stat.st_ino, stat.st_size, stat.st_mtime_ns) for name, stat in stats]

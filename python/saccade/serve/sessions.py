@@ -16,47 +16,35 @@ from saccade.serve.requests import RELEASED_CHUNKING, Options
 
 @dataclass(frozen=True, eq=False)
 class Chunk:
-    """The last chunk of a session.
-
-    Attributes:
-        actions: As the policy returned it.
-        rows: Number of observations that it is for.
-        horizon: Number of actions in it.
-    """
+    """The actions of a policy for a number of observations, and how many each has."""
 
     actions: Any
     rows: int
     horizon: int
 
 
+@dataclass(eq=False)
 class Session:
-    """One session. It is forgotten by dropping it, so an answer that is late continues nothing.
+    """One session. It is forgotten by dropping it, so an answer that is late continues nothing."""
 
-    Attributes:
-        owner: The connection that used it last.
-        chunk: Its last chunk, or None.
-    """
-
-    def __init__(self) -> None:
-        self.owner: Hashable = None
-        self.chunk: Chunk | None = None
-        self.used = 0.0
+    owner: Hashable = None  # the connection that used it last
+    used: float = 0.0
+    chunk: Chunk | None = None  # the last one
 
     def continued(self, options: Options, rows: int) -> tuple[Chunk, Chunking] | None:
-        """The chunk that a request continues, and how; None if there is nothing to continue.
-
-        Args:
-            options: The options of the request.
-            rows: Number of its observations.
+        """The chunk that a request of so many observations continues, and how; None if there is none.
 
         Raises:
             InputError: The request does not say how many actions were executed, is for another number of
                 robots, or continues more actions than the chunk has.
         """
-        chunk = self.chunk
+        chunk, chunking = self.chunk, options.chunking
         if chunk is None:
             return None
-        if options.executed is None and options.chunking is None:
+        if chunking is None and options.executed is not None:
+            overlap = max(0, chunk.horizon - options.executed)
+            chunking = Chunking(overlap, min(options.frozen, overlap), options.ramp_rate)
+        if chunking is None:
             raise InputError(
                 "options: executed: expected the number of actions that were executed of the last chunk of "
                 f"session {options.session!r:.100}, or {', '.join(RELEASED_CHUNKING)}, got none; "
@@ -67,23 +55,10 @@ class Session:
                 f"observation: expected {chunk.rows} rows, as session {options.session!r:.100} began, got "
                 f"{rows}"
             )
-        if options.chunking is not None:
-            return self._released(chunk, options.chunking)
-        assert options.executed is not None
-        overlap = chunk.horizon - options.executed
-        if overlap <= 0:
-            return None
-        return chunk, Chunking(
-            overlap=overlap, frozen=min(options.frozen, overlap), ramp_rate=options.ramp_rate
-        )
-
-    def _released(self, chunk: Chunk, chunking: Chunking) -> tuple[Chunk, Chunking] | None:
-        """The same, as the released head of N1.7 continues a chunk."""
-        horizon = chunking.horizon or chunk.horizon
-        if horizon > chunk.horizon:
+        if chunking.horizon is not None and chunking.horizon > chunk.horizon:
             raise InputError(
                 f"options: action_horizon: expected at most {chunk.horizon}, the actions of the session's "
-                f"last chunk, got {horizon}"
+                f"last chunk, got {chunking.horizon}"
             )
         return (chunk, chunking) if chunking.overlap else None
 
@@ -106,12 +81,7 @@ class Sessions:
         return len(self._sessions)
 
     def use(self, name: str | int, owner: Hashable) -> Session:
-        """The session of this name, which is made if there is none.
-
-        Args:
-            name: Its id.
-            owner: The connection that uses it.
-        """
+        """The session of this name, which a connection uses; it is made if there is none."""
         with self._lock:
             self._forget_old()
             session = self._sessions.pop(name, None) or Session()
@@ -122,11 +92,7 @@ class Sessions:
             return session
 
     def reset(self, name: str | int | None, owner: Hashable) -> int:
-        """Forgets a session, or without a name those that a connection used last.
-
-        Returns:
-            How many were forgotten.
-        """
+        """Forgets a session, or without a name those that a connection used last; returns how many."""
         with self._lock:
             self._forget_old()
             if name is not None:

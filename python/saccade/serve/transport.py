@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import contextlib
 import errno
-import os
 import socket
 import sys
 from collections.abc import Callable, Iterator, Sequence
@@ -33,9 +32,8 @@ MOST_ENVELOPE_FRAMES = 8
 MOST_ENVELOPE_BYTES = 255
 #: Requests that are read before answers are sent.
 READ_AT_ONCE = 64
-#: Time for the last answers to be sent when the socket is closed.
-FLUSH_SECONDS = 5.0
-BACKLOG = 128
+#: Milliseconds for the last answers to be sent when the socket is closed.
+FLUSH_MS = 5000
 #: Milliseconds that a heartbeat can announce.
 LONGEST_TTL = 6_553_500
 #: Of the authentication of clients.
@@ -53,36 +51,26 @@ CLOSED = "closed: its frame is larger than --max-message-mb or invalid, or it wa
 EVENTS = zmq.EVENT_ACCEPTED | zmq.EVENT_DISCONNECTED | sum(FAILURES)
 
 
+@dataclass(eq=False)
 class Connection:
-    """One TCP connection.
+    """One TCP connection: its address and port, and a duplicate of libzmq's socket."""
 
-    Attributes:
-        name: Its address and port.
-        is_open: Whether it is still connected. True in doubt. Any thread may read it.
-        peers: The clients that were seen on it; more than one only if libzmq's events came late.
-    """
-
-    def __init__(self, name: str, duplicate: socket.socket | None, *, is_open: bool = True) -> None:
-        self.name, self.is_open = name, is_open
-        self.peers: list[Peer] = []
-        self._duplicate = duplicate
+    name: str
+    duplicate: socket.socket | None = None
+    is_open: bool = True  # in doubt, too; any thread may read it
 
     def refuse(self) -> None:
         """Makes libzmq close it."""
-        if self._duplicate is not None:
+        if self.duplicate is not None:
             with contextlib.suppress(OSError):  # it is closed
-                self._duplicate.shutdown(socket.SHUT_RDWR)
+                self.duplicate.shutdown(socket.SHUT_RDWR)
 
     def close(self) -> str:
-        """Notes that it is closed.
-
-        Returns:
-            Why libzmq closed it, or nothing if the client did.
-        """
+        """Notes that it is closed; returns why libzmq closed it, or nothing if the client did."""
         self.is_open = False
-        if self._duplicate is None:
+        if self.duplicate is None:
             return "connected and was gone at once"
-        with self._duplicate as duplicate, contextlib.suppress(OSError):  # reset by the client
+        with self.duplicate as duplicate, contextlib.suppress(OSError):  # reset by the client
             with contextlib.suppress(BlockingIOError):  # the client would still send
                 if not duplicate.recv(1, socket.MSG_PEEK):
                     return ""
@@ -92,17 +80,11 @@ class Connection:
 
 @dataclass(eq=False)
 class Peer:
-    """A client's socket.
+    """A client's socket. A connection has more than one only if libzmq's events came late."""
 
-    Attributes:
-        identity: Its address in libzmq.
-        connection: Its connection.
-        modality_form: How it reads `get_modality_config`, once a request has shown it.
-    """
-
-    identity: bytes
+    identity: bytes  # its address in libzmq
     connection: Connection
-    modality_form: str | None = None
+    modality_form: str | None = None  # how it reads `get_modality_config`, once a request has shown it
 
     @property
     def chose_identity(self) -> bool:
@@ -115,37 +97,31 @@ class Transport:
 
     Args:
         listener: The TCP socket that clients connect to, from :func:`bind`.
-        limits: See there.
-        on_problem: Called with the name of a client and what is wrong with it.
-        keys: Keys for encryption, or None for none.
+        limits, keys: As in :class:`saccade.serve.Server`.
+        warn: Called with the name of a client and what is wrong with it.
     """
 
     def __init__(
         self,
         listener: socket.socket,
         limits: Limits,
-        on_problem: Callable[[str, str], None],
+        warn: Callable[[str, str], None],
         keys: ServerKeys | None = None,
     ) -> None:
-        self._listener, self._limits, self._on_problem = listener, limits, on_problem
-        self._address, self._family = address_of(listener), listener.family
+        self._listener, self._limits, self._warn = listener, limits, warn
+        self._keys, self._address, self._family = keys, address_of(listener), listener.family
         self._most_clients = min(limits.clients, _most_connections())
         self._by_file: dict[int, Connection] = {}
         self._peers: dict[bytes, Peer] = {}
         self._failure = ""
-        self._keys = keys
         self._waker, self._woken = socket.socketpair()
         for end in (self._waker, self._woken):
             end.setblocking(False)
 
     def listen(self) -> None:
-        """Accepts clients from now on.
-
-        Raises:
-            OSError: Another program took the address meanwhile.
-        """
+        """Accepts clients from now on; an `OSError` says that another program took the address meanwhile."""
         try:
-            self._listener.listen(BACKLOG)
+            self._listener.listen(128)
         except OSError as error:
             self._listener.close()
             raise _named(error, self._address) from None
@@ -173,11 +149,7 @@ class Transport:
             self._waker.send(b"\0")
 
     def requests(self, timeout: float) -> Iterator[tuple[Peer, list[bytes], memoryview]]:
-        """The requests that have arrived, or that arrive within a number of seconds.
-
-        Yields:
-            The client, the frames before the request, which go before the answer, and the request.
-        """
+        """Client, frames before the request, and request, of those that arrive within so many seconds."""
         if any(ready == self._woken.fileno() for ready, _ in self._poller.poll(int(1e3 * timeout))):
             with contextlib.suppress(BlockingIOError):
                 while self._woken.recv(4096):
@@ -189,12 +161,9 @@ class Transport:
             except zmq.Again:
                 return
             peer = self._peer(identity.bytes, payload.get(zmq.SRCFD))
-            if len(frames) > MOST_ENVELOPE_FRAMES or any(
-                len(frame) > MOST_ENVELOPE_BYTES for frame in frames
-            ):
-                self._on_problem(
-                    peer.connection.name, "expected a request in one frame, got several; ignored"
-                )
+            longest = max(map(len, frames), default=0)
+            if len(frames) > MOST_ENVELOPE_FRAMES or longest > MOST_ENVELOPE_BYTES:
+                self._warn(peer.connection.name, "expected a request in one frame, got several; ignored")
                 continue
             yield peer, [frame.bytes for frame in frames], payload.buffer
 
@@ -203,7 +172,7 @@ class Transport:
         try:
             self._router.send_multipart([peer.identity, *frames, answer], zmq.NOBLOCK)
         except zmq.Again:
-            self._on_problem(peer.connection.name, "does not read its answers; one was not sent")
+            self._warn(peer.connection.name, "does not read its answers; one was not sent")
             return False
         except zmq.ZMQError as error:
             if error.errno != errno.EHOSTUNREACH:
@@ -212,10 +181,10 @@ class Transport:
         return True
 
     def close(self) -> None:
-        """Sends what waits, for at most `FLUSH_SECONDS`, and closes everything."""
+        """Sends what waits, for at most some seconds, and closes everything."""
         self._router.disable_monitor()
         self._monitor.close(linger=0)
-        self._router.close(linger=int(1e3 * FLUSH_SECONDS))
+        self._router.close(linger=FLUSH_MS)
         if self._authenticator is not None:
             self._authenticator.stop()
         self._context.term()
@@ -265,7 +234,7 @@ class Transport:
             if event == zmq.EVENT_ACCEPTED:
                 connection = self._by_file[file] = self._connection(file)
                 if len(self._by_file) > self._most_clients:
-                    self._on_problem(connection.name, f"refused: {self._most_clients} clients are connected")
+                    self._warn(connection.name, f"refused: {self._most_clients} clients are connected")
                     connection.refuse()
 
     def _connection(self, file: int) -> Connection:
@@ -274,17 +243,13 @@ class Transport:
         Its file descriptor is duplicated, since libzmq does not say which side closes a connection. libzmq
         may have closed it already, and another file may have its number: its address shows it.
         """
-        duplicate = None
-        try:
-            duplicate = socket.fromfd(file, self._family, socket.SOCK_STREAM)
+        with contextlib.suppress(OSError), contextlib.ExitStack() as stack:
+            duplicate = stack.enter_context(socket.fromfd(file, self._family, socket.SOCK_STREAM))
             if duplicate.getsockname()[1] == int(self._address.rpartition(":")[2]):
                 host, port = duplicate.getpeername()[:2]
+                stack.pop_all()  # it stays open
                 return Connection(f"{host}:{port}", duplicate)
-        except OSError:
-            pass
-        if duplicate is not None:
-            duplicate.close()
-        return Connection("unknown", None)
+        return Connection("unknown")
 
     def _forget(self, file: int) -> None:
         """Notes that the connection with a file descriptor is closed, if there is one."""
@@ -292,11 +257,11 @@ class Transport:
         connection = self._by_file.pop(file, None)
         if connection is None:
             return
-        for peer in connection.peers:
-            self._peers.pop(peer.identity, None)
+        for peer in [one for one in self._peers.values() if one.connection is connection]:
+            del self._peers[peer.identity]
         closed = connection.close()
         if failure or closed:
-            self._on_problem(connection.name, failure or closed)
+            self._warn(connection.name, failure or closed)
 
     def _peer(self, identity: bytes, file: int) -> Peer:
         """The client with an identity, whose request came from a file descriptor.
@@ -309,9 +274,8 @@ class Transport:
             self._read_events()
             connection = self._by_file.get(file)
             if connection is None:
-                return Peer(identity, Connection("unknown", None, is_open=False))
+                return Peer(identity, Connection("unknown", is_open=False))
             peer = self._peers[identity] = Peer(identity, connection)
-            connection.peers.append(peer)
         return peer
 
 
@@ -335,24 +299,22 @@ def bind(host: str, port: int) -> socket.socket:
     Raises:
         OSError: It cannot be taken; names it.
     """
-    taken = None
+    name = None if host == "*" else host
     try:
         if not 0 <= port <= 0xFFFF:  # which would be cut to 16 bits
             raise OverflowError("expected a port of 0 to 65535")
-        given = socket.getaddrinfo(
-            None if host == "*" else host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
-        )
+        given = socket.getaddrinfo(name, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
         family, kind, protocol, _, address = given[0]
-        taken = socket.socket(family, kind, protocol)
-        # A restarted server need not wait until the connections of the last one are forgotten.
-        taken.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        taken.setblocking(False)
-        taken.bind(address)
+        with contextlib.ExitStack() as stack:
+            taken = stack.enter_context(socket.socket(family, kind, protocol))
+            # A restarted server need not wait until the connections of the last one are forgotten.
+            taken.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            taken.setblocking(False)
+            taken.bind(address)
+            stack.pop_all()  # it stays open
+            return taken
     except (OSError, UnicodeError, OverflowError) as error:
-        if taken is not None:
-            taken.close()
         raise _named(error, f"{host}:{port}") from None
-    return taken
 
 
 def address_of(listener: socket.socket) -> str:
@@ -364,7 +326,5 @@ def address_of(listener: socket.socket) -> str:
 def _named(error: Exception, where: str) -> OSError:
     """An error about an address, with its name."""
     if isinstance(error, OSError) and error.errno is not None:
-        return OSError(
-            error.errno, os.strerror(error.errno) if error.errno > 0 else str(error.strerror), where
-        )
+        return OSError(error.errno, str(error.strerror), where)
     return OSError(errno.EINVAL, str(error), where)
