@@ -1,4 +1,9 @@
-"""Converts arguments to the arrays of the engine, and results to NumPy or torch like the arguments."""
+"""Converts arguments to the arrays of the engine, and results to NumPy or torch like the arguments.
+
+Errors name the argument. A DtypeError says that numbers are of another kind, or that a tensor is not dense or
+not on the CPU; a ShapeError that something is no array, or has another shape; an InputError that an integer,
+text or index is something else or out of range.
+"""
 
 from __future__ import annotations
 
@@ -49,14 +54,11 @@ def float32(name: str, value: ArrayLike) -> Float32Array:
 
     float64, float16 and bfloat16 are converted. A value beyond the range of float32 becomes infinite, which
     the engine refuses.
-
-    Raises:
-        DtypeError: ``value`` contains integers, booleans or anything else that is not a real float, or is not
-            on the CPU.
-        ShapeError: ``value`` is a ragged sequence.
     """
     if is_torch(value):
-        value = _from_torch(name, value, "floating point")
+        if not value.dtype.is_floating_point:  # type: ignore[union-attr]
+            raise DtypeError(f"{name}: expected floating point values, got {value.dtype}")  # type: ignore[union-attr]
+        value = _torch_memory(name, value, sys.modules["torch"].float32)
     array = _asarray(name, value)
     # The case of a control loop. The rest takes a microsecond or two, as long as all other checks of a call.
     if array.dtype == FLOAT32 and array.flags.carray:
@@ -69,17 +71,11 @@ def float32(name: str, value: ArrayLike) -> Float32Array:
 
 
 def exact_float32(name: str, value: ArrayLike) -> Float32Array:
-    """As `float32`, for numbers in a robot's units: integers are taken if float32 holds them exactly.
-
-    Raises:
-        DtypeError, ShapeError: As `float32`; or float32 does not hold an integer.
-    """
+    """As `float32`, for numbers in a robot's units: integers are taken if float32 holds them exactly."""
     if isinstance(value, np.ma.MaskedArray):
         raise DtypeError(f"{name}: expected an array without a mask, got {type(value).__name__}")
-    if is_torch(value):
-        if value.is_floating_point() or value.is_complex() or value.is_sparse:  # type: ignore[union-attr]
-            return float32(name, value)
-        value = _torch_memory(name, value.detach())  # type: ignore[union-attr]
+    if is_torch(value) and (value.is_floating_point() or value.is_complex() or value.is_sparse):  # type: ignore[union-attr]
+        return float32(name, value)
     array = _asarray(name, value)
     if array.dtype.kind not in "iu":
         return float32(name, array)
@@ -103,14 +99,7 @@ def inexact(integers: Any) -> int | None:
 
 
 def frame(name: str, value: ArrayLike) -> npt.NDArray[Any]:
-    """A camera frame as a C-contiguous array of uint8, float32 or float64, copied only if it must be.
-
-    Raises:
-        DtypeError: ``value`` has another dtype, or is not on the CPU.
-        ShapeError: ``value`` is not an array.
-    """
-    if is_torch(value):
-        value = _torch_memory(name, value.detach())  # type: ignore[union-attr]
+    """A camera frame as a C-contiguous array of uint8, float32 or float64, copied only if it must be."""
     array = _asarray(name, value)
     if array.dtype not in (np.uint8, np.float32, np.float64):
         raise DtypeError(f"{name}: expected a frame of uint8, float32 or float64, got {array.dtype}")
@@ -165,11 +154,7 @@ def _as_stored(name: str, tensor: Any) -> StoredTensor:
 
 
 def text(name: str, value: Any) -> str:
-    """``value`` as text that the engine can take.
-
-    Raises:
-        InputError: It is not a string, or contains a surrogate, which UTF-8 cannot encode.
-    """
+    """``value`` as text that the engine can take."""
     if not isinstance(value, str):
         raise InputError(f"{name}: expected a string, got {value!r} ({type(value).__name__})")
     try:
@@ -180,11 +165,7 @@ def text(name: str, value: Any) -> str:
 
 
 def check_precision(precision: str) -> None:
-    """Checks that ``precision`` is text. The engine checks which text.
-
-    Raises:
-        InputError: It is anything else.
-    """
+    """Checks that ``precision`` is text. The engine checks which text."""
     if not isinstance(precision, str):
         raise InputError(
             f"precision: expected one of {str(PRECISIONS)[1:-1]}, got {precision!r} "
@@ -197,14 +178,9 @@ def boolean(name: str, value: ArrayLike | None) -> npt.NDArray[np.bool_] | None:
     """``value`` as a C-contiguous boolean array. None stays None.
 
     A view of other memory may have bytes that are neither 0 nor 1. They count as True, as they do in NumPy.
-
-    Raises:
-        DtypeError: ``value`` contains anything but booleans, or is not on the CPU.
     """
     if value is None:
         return None
-    if is_torch(value):
-        value = _from_torch(name, value, "boolean")
     array = _asarray(name, value)
     if array.dtype != np.bool_:
         raise DtypeError(f"{name}: expected booleans, got {array.dtype}")
@@ -212,23 +188,13 @@ def boolean(name: str, value: ArrayLike | None) -> npt.NDArray[np.bool_] | None:
 
 
 def mask_bytes(name: str, value: ArrayLike | None) -> UInt8Array | None:
-    """:func:`boolean` as the bytes that the engine takes, since not every byte of NumPy is a boolean of Rust.
-
-    Raises:
-        DtypeError: ``value`` contains anything but booleans, or is not on the CPU.
-    """
+    """:func:`boolean` as bytes for the engine, since not every byte of NumPy is a boolean of Rust."""
     array = boolean(name, value)
     return None if array is None else array.view(np.uint8)
 
 
 def int64(name: str, value: ArrayLike | int) -> npt.NDArray[np.int64]:
-    """One or several integers as a C-contiguous int64 array.
-
-    Raises:
-        InputError: ``value`` contains anything but integers in the range of int64.
-    """
-    if is_torch(value):
-        value = _from_torch(name, value, "integer")
+    """One or several integers as a C-contiguous int64 array."""
     try:
         array = _asarray(name, value)
     except ShapeError as error:
@@ -236,7 +202,8 @@ def int64(name: str, value: ArrayLike | int) -> npt.NDArray[np.int64]:
     if array.dtype == INT64 and array.flags.carray:
         return cast("npt.NDArray[np.int64]", array)
     if array.dtype.kind not in "iu":
-        raise InputError(f"{name}: expected an integer or an array of integers, got {_shown(value, array)}")
+        shown = repr(value) if array.ndim == 0 else f"an array of {array.dtype}"
+        raise InputError(f"{name}: expected an integer or an array of integers, got {shown}")
     if array.dtype.kind == "u" and array.size and int(array.max()) > np.iinfo(np.int64).max:
         raise InputError(f"{name}: expected integers that fit in 64 bits, got {array.max()}")
     # ascontiguousarray would give a scalar an axis.
@@ -244,11 +211,7 @@ def int64(name: str, value: ArrayLike | int) -> npt.NDArray[np.int64]:
 
 
 def optional_integers(name: str, values: Sequence[int] | None) -> list[int] | None:
-    """A sequence of integers as a list. None stays None.
-
-    Raises:
-        InputError: ``values`` is not a sequence of integers in the range of int64.
-    """
+    """A sequence of integers as a list. None stays None."""
     if values is None:
         return None
     try:
@@ -265,11 +228,7 @@ def optional_integers(name: str, values: Sequence[int] | None) -> list[int] | No
 
 
 def integer(name: str, value: int, least: int = 1) -> int:
-    """``value`` as an integer of at least ``least``.
-
-    Raises:
-        InputError: ``value`` is not an integer, or is less than ``least``.
-    """
+    """``value`` as an integer of at least ``least``."""
     try:
         if isinstance(value, (bool, np.bool_)):
             raise TypeError
@@ -285,11 +244,7 @@ def integer(name: str, value: int, least: int = 1) -> int:
 
 
 def indices(name: str, value: Any) -> tuple[int, ...] | None:
-    """One or several distinct indices in the order given; those of a set in ascending order. None stays None.
-
-    Raises:
-        InputError: ``value`` contains anything but distinct integers of at least 0.
-    """
+    """One or several distinct indices in the order given; those of a set ascending. None stays None."""
     if value is None:
         return None
     if isinstance(value, (str, bytes)):
@@ -367,6 +322,9 @@ def like_features(array: npt.NDArray[Any], use_torch: bool) -> Array:
 
 
 def _asarray(name: str, value: Any) -> npt.NDArray[Any]:
+    """``value`` as an array, which shares the memory of an array or a tensor."""
+    if is_torch(value):
+        return _torch_memory(name, value)
     try:
         return np.asarray(value)
     except OverflowError as error:
@@ -375,23 +333,11 @@ def _asarray(name: str, value: Any) -> npt.NDArray[Any]:
         raise ShapeError(f"{name}: expected an array, got {type(value).__name__} ({error})") from None
 
 
-def _from_torch(name: str, tensor: Any, kind: str) -> npt.NDArray[Any]:
-    torch = sys.modules["torch"]
-    if kind == "floating point":
-        if not tensor.dtype.is_floating_point:
-            raise DtypeError(f"{name}: expected floating point values, got {tensor.dtype}")
-        return _torch_memory(name, tensor.detach(), torch.float32)
-    return _torch_memory(name, tensor.detach())
-
-
 def _torch_memory(name: str, tensor: Any, dtype: Any = None) -> npt.NDArray[Any]:
     if tensor.device.type != "cpu":
         raise DtypeError(f"{name}: expected a tensor on the CPU, got one on {tensor.device}")
+    tensor = tensor.detach()
     try:
         return (tensor if dtype is None else tensor.to(dtype)).numpy()  # type: ignore[no-any-return]
     except (TypeError, RuntimeError) as error:
         raise DtypeError(f"{name}: expected a dense tensor that NumPy can hold: {error}") from None
-
-
-def _shown(value: Any, array: npt.NDArray[Any]) -> str:
-    return repr(value) if array.ndim == 0 else f"an array of {array.dtype}"

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import importlib.util
 import os
-import re
 import shlex
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -24,7 +23,7 @@ class Extras:
     Attributes:
         distribution: Name of the distribution.
         folder: Its folder in a checkout.
-        modules: The modules that each extra adds, and the distribution that contains each module.
+        modules: The modules that each extra adds, and the requirement of each, as in pyproject.toml.
         includes: The extras that an extra includes, of this distribution.
     """
 
@@ -68,30 +67,16 @@ class Extras:
             return None
         return self._missing([module], [self._extra_of(module)])
 
-    def install_command(self, extras: list[str], modules: list[str]) -> str:
-        """A shell command that installs extras, or what is missing of them.
-
-        In a checkout the command installs the extras from the checkout. Elsewhere it names the missing
-        packages, with the versions that the metadata of the distribution asks for.
-
-        Args:
-            extras: Names of extras.
-            modules: The missing modules.
-        """
+    def install_command(self, extras: Sequence[str], modules: Sequence[str]) -> str:
+        """A shell command that installs extras; without a checkout, the packages of the missing modules."""
         included = {name for extra in extras for name in self.includes.get(extra, ())}
         wanted = ",".join(extra for extra in extras if extra not in included)
-        checkout = _checkout()
-        if checkout is None:
-            return pip_install(*map(self._requirement, modules))
-        shown = _shown(checkout / self.folder)
-        return pip_install("--editable", f"{shown}[{wanted}]")
+        packages = [self.modules[self._extra_of(module)][module] for module in modules]
+        return _install(self.folder, wanted, packages)
 
     def install_lab(self) -> str:
         """A shell command that installs saccade-vla-lab with what its simulation needs."""
-        checkout = _checkout()
-        if checkout is None:
-            return pip_install("saccade-vla-lab[sim]")
-        return pip_install("--editable", f"{_shown(checkout / 'lab')}[sim]")
+        return _install("lab", "sim", ["saccade-vla-lab[sim]"])
 
     def _missing(self, modules: list[str], extras: list[str]) -> MissingExtraError:
         """The error for these missing modules of these extras."""
@@ -108,31 +93,16 @@ class Extras:
                 return extra
         raise KeyError(module)
 
-    def _requirement(self, module: str) -> str:
-        """The distribution of a module with the versions that are accepted, such as ``"jinja2>=3.1"``."""
-        import importlib.metadata  # not at the top: `import saccade` should stay cheap
-
-        distribution = self.modules[self._extra_of(module)][module]
-        try:
-            required = importlib.metadata.requires(self.distribution) or []
-        except importlib.metadata.PackageNotFoundError:
-            required = []
-        for line in required:
-            found = re.match(rf"{re.escape(distribution)}\s*([^\w\s;\[-][^;]*)?(;|$)", line, re.IGNORECASE)
-            if found is not None:
-                return distribution + (found[1] or "").strip()
-        return distribution
-
 
 #: The extras of saccade-vla.
 SACCADE = Extras(
     "saccade-vla",
     ".",
     {
-        "cli": {"rich": "rich", "PIL": "pillow"},
-        "torch": {"torch": "torch", "safetensors": "safetensors"},
-        "serve": {"zmq": "pyzmq", "msgpack": "msgpack"},
-        "hub": {"huggingface_hub": "huggingface_hub"},
+        "cli": {"rich": "rich>=13", "PIL": "pillow>=10"},
+        "torch": {"torch": "torch>=2.4", "safetensors": "safetensors>=0.4"},
+        "serve": {"zmq": "pyzmq>=25", "msgpack": "msgpack>=1.0"},
+        "hub": {"huggingface_hub": "huggingface_hub>=0.25"},
     },
     {"serve": ("cli",)},
 )
@@ -157,10 +127,12 @@ def pip_install(*arguments: str) -> str:
     return " ".join(map(shlex.quote, [*command, *arguments]))
 
 
-def _checkout() -> Path | None:
-    """The checkout that this package is imported from; None if it was installed from a wheel or a copy."""
-    folder = Path(__file__).resolve().parents[3]
-    return folder if (folder / "pyproject.toml").is_file() and (folder / "crates").is_dir() else None
+def _install(folder: str, extras: str, packages: Sequence[str]) -> str:
+    """A command that installs extras of a folder of the checkout; without a checkout, packages."""
+    checkout = Path(__file__).resolve().parents[3]
+    if not ((checkout / "pyproject.toml").is_file() and (checkout / "crates").is_dir()):
+        return pip_install(*packages)
+    return pip_install("--editable", f"{_shown(checkout / folder)}[{extras}]")
 
 
 def _shown(path: Path) -> str:

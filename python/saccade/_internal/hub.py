@@ -29,17 +29,14 @@ DEFAULT_REVISION = "main"
 
 @dataclass(frozen=True)
 class Location:
-    """Where the files of a checkpoint are.
-
-    Attributes:
-        path: A file or a directory. For an id, the directory of one commit in the local cache.
-        id: The id of a published repository; None for a local path.
-        commit: The commit that ``revision`` named when it was resolved; None for a local path.
-    """
+    """Where the files of a checkpoint are."""
 
     path: Path
+    """A file or a directory. For an id, the directory of one commit in the local cache."""
     id: str | None = None
+    """The id of a published repository; None for a local path."""
     commit: str | None = None
+    """The commit that ``revision`` named when it was resolved; None for a local path."""
 
 
 def resolve(

@@ -18,30 +18,17 @@ LISTINGS = "saccade"
 def cache() -> Path:
     """The directory in which ``huggingface_hub`` keeps published repositories."""
     constants = sys.modules.get("huggingface_hub.constants")
-    given = (
-        os.environ.get("HF_HUB_CACHE") or os.environ.get("HUGGINGFACE_HUB_CACHE")
-        if constants is None
-        else constants.HF_HUB_CACHE
-    )
-    if given:
-        return Path(given).expanduser()
-    home = os.environ.get("HF_HOME")
-    if home:
-        return Path(home).expanduser() / "hub"
+    if constants is None:
+        given = os.environ.get("HF_HUB_CACHE") or os.environ.get("HUGGINGFACE_HUB_CACHE")
+    else:
+        given = constants.HF_HUB_CACHE
     base = os.environ.get("XDG_CACHE_HOME") or "~/.cache"
-    return Path(base).expanduser() / "huggingface" / "hub"
+    home = os.environ.get("HF_HOME") or f"{base}/huggingface"
+    return Path(given or f"{home}/hub").expanduser()
 
 
 def folder_of(name: str, revision: str) -> Path | None:
-    """The directory of a revision in the cache, whichever of its files it contains.
-
-    Args:
-        name: An id such as ``Qwen/Qwen3-VL-2B-Instruct``.
-        revision: A branch, tag or commit.
-
-    Returns:
-        None if it is not there.
-    """
+    """The directory of a branch, tag or commit in the cache, whichever of its files it has; None for none."""
     repository = _repository(name)
     try:
         commit = (repository / "refs" / revision).read_text(encoding="utf-8").strip()
@@ -53,12 +40,8 @@ def folder_of(name: str, revision: str) -> Path | None:
 
 def write_revision(name: str, revision: str, commit: str) -> None:
     """Records which commit a revision was when it was downloaded, as ``huggingface_hub`` does."""
-    path = _repository(name) / "refs" / revision
     if revision != commit:
-        with suppress(OSError):  # a cache that cannot be written, such as a shared one
-            path.parent.mkdir(parents=True, exist_ok=True)
-            with write_atomically(path) as temporary:
-                temporary.write_text(commit, encoding="utf-8")
+        _write(_repository(name) / "refs" / revision, commit)
 
 
 def read_listing(folder: Path) -> list[str] | None:
@@ -72,12 +55,15 @@ def read_listing(folder: Path) -> list[str] | None:
 
 def write_listing(folder: Path, names: list[str]) -> None:
     """Records the names of all files of a commit."""
-    path = _listing(folder)
     if read_listing(folder) != names:
-        with suppress(OSError):  # as above
-            path.parent.mkdir(parents=True, exist_ok=True)
-            with write_atomically(path) as temporary:
-                temporary.write_text(json.dumps(names), encoding="utf-8")
+        _write(_listing(folder), json.dumps(names))
+
+
+def _write(path: Path, text: str) -> None:
+    with suppress(OSError):  # a cache that cannot be written, such as a shared one
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with write_atomically(path) as temporary:
+            temporary.write_text(text, encoding="utf-8")
 
 
 def _listing(folder: Path) -> Path:

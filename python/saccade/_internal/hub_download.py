@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import glob
 import importlib.util
+from dataclasses import dataclass
 from pathlib import Path
 
 from saccade._internal.extras import SACCADE
@@ -16,29 +18,20 @@ SERVER_ERROR = 500
 DENIED = (401, 403)
 
 
+@dataclass(eq=False)
 class Offline(Exception):
-    """The Hub cannot be asked.
+    """The Hub cannot be asked."""
 
-    Attributes:
-        reason: Why, as a clause.
-        remedy: What to do about it, a sentence or empty.
-        is_unexpected: Whether the connection failed, rather than being switched off or not installed.
-    """
-
-    def __init__(self, reason: str, remedy: str = "", is_unexpected: bool = False) -> None:
-        super().__init__(reason)
-        self.reason = reason
-        self.remedy = remedy
-        self.is_unexpected = is_unexpected
+    reason: str
+    """Why, as a clause."""
+    remedy: str = ""
+    """What to do about it, a sentence or empty."""
+    is_unexpected: bool = False
+    """Whether the connection failed, rather than being switched off or not installed."""
 
 
 def list_files(name: str, revision: str, argument: str) -> tuple[str, list[str]]:
     """The commit that a revision is now, and the names of all of its files in ascending order.
-
-    Args:
-        name: An id.
-        revision: A branch, tag or commit.
-        argument: Name of the argument, for messages.
 
     Raises:
         Offline: The Hub cannot be asked.
@@ -70,14 +63,7 @@ def list_files(name: str, revision: str, argument: str) -> tuple[str, list[str]]
 
 
 def download(name: str, commit: str, files: tuple[str, ...], listed: list[str], argument: str) -> Path:
-    """Downloads the files of a commit that match ``files`` and are not in the cache yet.
-
-    Args:
-        name: An id.
-        commit: The commit.
-        files: Patterns of the files that are needed.
-        listed: The names of all files of the commit.
-        argument: Name of the argument, for messages.
+    """Downloads those files ``listed`` of a commit that match ``files`` and are not in the cache yet.
 
     Returns:
         The directory of the commit in the cache.
@@ -89,8 +75,7 @@ def download(name: str, commit: str, files: tuple[str, ...], listed: list[str], 
     """
     from huggingface_hub import snapshot_download
 
-    # Names as patterns: in brackets, the characters of patterns stand for themselves.
-    names = ["".join(f"[{c}]" if c in "*?[" else c for c in one) for one in wanted(files, listed)]
+    names = [glob.escape(name) for name in wanted(files, listed)]
     stopped = (
         f"{argument}: {name}: the download stopped ({{}}). Call again to continue it: finished files are kept"
     )
@@ -129,9 +114,11 @@ def _refusal(error: BaseException | None, name: str, revision: str, argument: st
         RevisionNotFoundError,
     )
 
+    while not isinstance(error, HfHubHTTPError) or error.response is None:
+        if error is None:
+            return None
+        error = error.__cause__
     what = f"{argument}: {name}"
-    if error is None:
-        return None
     if isinstance(error, RevisionNotFoundError):
         return FileNotFoundError(f"{what}: the repository has no revision {revision}")
     if isinstance(error, GatedRepoError):
@@ -144,15 +131,12 @@ def _refusal(error: BaseException | None, name: str, revision: str, argument: st
             f"{what}: no such path{neighbour(name)}, and no such repository on the Hub, unless it is "
             "private: then log in with: hf auth login"
         )
-    response = getattr(error, "response", None)
-    if isinstance(error, HfHubHTTPError) and response is not None:
-        status = response.status_code
-        if status in DENIED:
-            return PermissionError(f"{what}: the Hub denies access ({_line(error)})")
-        if status < SERVER_ERROR and status != OVERLOADED:
-            return FileNotFoundError(f"{what}: the Hub refuses the request ({_line(error)})")
+    status = error.response.status_code
+    if status >= SERVER_ERROR or status == OVERLOADED:
         return None
-    return _refusal(error.__cause__, name, revision, argument)
+    if status in DENIED:
+        return PermissionError(f"{what}: the Hub denies access ({_line(error)})")
+    return FileNotFoundError(f"{what}: the Hub refuses the request ({_line(error)})")
 
 
 def neighbour(name: str) -> str:

@@ -69,16 +69,10 @@ def wanted(files: tuple[str, ...], names: Iterable[str]) -> list[str]:
 
 
 def missing_files(folder: Path, files: tuple[str, ...], listed: list[str] | None) -> list[str]:
-    """What is needed and not in ``folder``.
+    """Names of the files that are needed and not in ``folder``, or a pattern of which no file exists.
 
-    Args:
-        folder: A commit in the cache.
-        files: Patterns of the files that are needed.
-        listed: The names of all files of the commit. None if they are not known: then only files without
-            which nothing can be read are missing.
-
-    Returns:
-        Names, or a pattern of which no file exists.
+    If it is not known which files are ``listed`` in the repository, only files without which nothing can be
+    read are missing.
     """
     if listed is not None:
         return [name for name in wanted(files, listed) if not (folder / name).is_file()]
@@ -102,13 +96,12 @@ def absent_files(files: tuple[str, ...], names: Iterable[str]) -> list[str]:
 
 def _missing_shards(folder: Path, files: tuple[str, ...]) -> list[str]:
     """The files that an index names and that are missing."""
-    indexes = sorted(folder.glob("*.safetensors.index.json")) if "*.safetensors" in files else []
+    if "*.safetensors" not in files:
+        return []
+    shards: set[str] = set()
     try:
-        shards = {name for index in indexes for name in _shards(index)}
+        for index in folder.glob("*.safetensors.index.json"):
+            shards.update(json.loads(index.read_text(encoding="utf-8"))["weight_map"].values())
         return sorted(shard for shard in shards if not (folder / shard).exists())
     except (OSError, ValueError, LookupError, TypeError, AttributeError):
         return []  # the reader of the index reports what is wrong with it
-
-
-def _shards(index: Path) -> set[str]:
-    return set(json.loads(index.read_text(encoding="utf-8"))["weight_map"].values())

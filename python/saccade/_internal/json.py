@@ -17,12 +17,6 @@ def dumps(
 ) -> str:
     """`json.dumps`, with ``null`` in place of ``NaN`` and ``Infinity``, which are not JSON.
 
-    Args:
-        value: What `json.dumps` takes.
-        indent: As in `json.dumps`.
-        ensure_ascii: As in `json.dumps`.
-        default: As in `json.dumps`.
-
     Example:
         >>> dumps({"mean": float("nan"), "count": 2})
         '{"mean": null, "count": 2}'
