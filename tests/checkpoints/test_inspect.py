@@ -18,10 +18,9 @@ from torch import Tensor, nn
 import saccade
 from saccade import _saccade, cli
 from saccade.checkpoints import quantize
-from saccade.checkpoints.findings import Counts, Inspection, Part
+from saccade.checkpoints.findings import Counts, Inspection, Part, in_order, part_of
 from saccade.checkpoints.initialisation import Draw, distance, draw, is_as_drawn, sample
 from saccade.checkpoints.inspection import inspect
-from saccade.checkpoints.parts import in_order, part_of
 from saccade.checkpoints.survey import robust_z
 from saccade.checkpoints.tokens import token_statistics
 from saccade.errors import CheckpointError

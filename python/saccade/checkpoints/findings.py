@@ -4,9 +4,39 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import TypeVar
 
 from saccade.checkpoints.description import Description
 from saccade.checkpoints.whole import BackboneFindings, RobotFindings
+
+FoundT = TypeVar("FoundT")
+
+#: The parts in the order of the tables, with the prefix of their tensors' names.
+PARTS = {
+    "DiT blocks": "model.transformer_blocks.",
+    "timestep encoder": "model.timestep_encoder.",
+    "output projections": "model.proj_out_",
+    "VL self-attention": "vl_self_attention.",
+    "vlln": "vlln.",
+    "state encoder": "state_encoder.",
+    "action encoder": "action_encoder.",
+    "action decoders": "action_",
+    "future tokens": "future_tokens.",
+    "positions": "position_embedding.",
+}
+#: Tensors that only training uses.
+UNUSED = "training only"
+
+
+def part_of(name: str) -> str:
+    """The part that a tensor belongs to, by its name without prefix."""
+    found = (part for part, start in PARTS.items() if name.startswith(start))
+    return next(found, UNUSED)
+
+
+def in_order(parts: Mapping[str, FoundT]) -> dict[str, FoundT]:
+    """What was found of each part, in the order of `PARTS`."""
+    return {name: parts[name] for name in (*PARTS, UNUSED) if name in parts}
 
 
 @dataclass(frozen=True)
@@ -107,18 +137,18 @@ class TokenStatistics(TokenGeometry):
     """The ``future_key_bias`` of the config."""
 
 
-@dataclass(frozen=True)
+@dataclass
 class PartResemblance:
     """How similar one part is to the same part of the reference."""
 
-    compared: int
+    compared: int = 0
     """Number of tensors that were compared. Each embodiment's slice counts separately. Tensors that the
     reference has as initialised (biases, norms) are left out."""
-    identical: int
+    identical: int = 0
     """How many of them are equal."""
-    cosine: Spread | None
+    cosine: Spread | None = None
     """Cosines of the other weights with those of the reference."""
-    largest_change: float
+    largest_change: float = 0.0
     """The largest norm of a difference, relative to the norm of the reference's tensor."""
 
 

@@ -13,7 +13,7 @@ from saccade.checkpoints.description import Config, Description, Source, descrip
 from saccade.checkpoints.evidence import from_noise, odd_embodiments, odd_tokens
 from saccade.checkpoints.findings import Counts, Inspection, Memory
 from saccade.checkpoints.resemblance import Reference
-from saccade.checkpoints.survey import Slice, Survey
+from saccade.checkpoints.survey import Survey
 from saccade.checkpoints.tokens import token_statistics
 from saccade.checkpoints.whole import backbone_of, robots_of
 from saccade.errors import InputError, SaccadeError
@@ -62,14 +62,9 @@ def inspect(
             f"reference: {other.source} is of GR00T {other.version.upper()}, expected "
             f"{head.version.upper()}, the version of source"
         )
-
-    def compare(one: Slice) -> None:
-        if other is not None:
-            other.compare(one)
-
     path = resolve(source)
     outside = _outside(description)
-    survey = Survey(published, head, compare, progress)
+    survey = Survey(published, head, None if other is None else other.compare, progress)
     parts = survey.parts()
     embodiments = survey.embodiments(_embodiment_names(description))
     tokens = None

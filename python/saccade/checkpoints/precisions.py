@@ -123,15 +123,9 @@ def check_precisions(
     Args:
         source: The checkpoint, as for :meth:`saccade.Policy.from_pretrained`.
         directory: Pictures, as :func:`saccade.observations.pictures.read_frames` reads them.
-        instruction: As for :func:`saccade.observations.pictures.read_frames`.
-        state: As for :func:`saccade.observations.pictures.read_frames`.
-        embodiment: As for :meth:`saccade.Policy.from_pretrained`.
-        preprocessing: As for :meth:`saccade.Policy.from_pretrained`.
-        tokenizer: As for :meth:`saccade.Policy.from_pretrained`.
-        data_config: As for :meth:`saccade.Policy.from_pretrained`.
-        action_horizon: As for :meth:`saccade.Policy.from_pretrained`.
-        processor_options: As for :meth:`saccade.Policy.from_pretrained`.
-        num_threads: As for :meth:`saccade.Policy.from_pretrained`.
+        instruction, state: As for :func:`saccade.observations.pictures.read_frames`.
+        embodiment, preprocessing, tokenizer, data_config, action_horizon, processor_options, num_threads: As
+            for :meth:`saccade.Policy.from_pretrained`.
         seed: Seed of the noise, at least 0.
         progress: Called with the number of precisions that are done, and of all.
 

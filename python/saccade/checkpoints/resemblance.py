@@ -3,26 +3,14 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass, field
 
 import numpy as np
 
 from saccade.checkpoints.description import Source, open_published
-from saccade.checkpoints.findings import PartResemblance, Resemblance
+from saccade.checkpoints.findings import PartResemblance, Resemblance, in_order, part_of
 from saccade.checkpoints.initialisation import is_norm
-from saccade.checkpoints.parts import PARTS, UNUSED, part_of
 from saccade.checkpoints.survey import Slice, dot
 from saccade.checkpoints.tokens import spread_of
-
-
-@dataclass
-class _Compared:
-    """What was counted of one part so far."""
-
-    compared: int = 0
-    identical: int = 0
-    cosines: list[float] = field(default_factory=list)
-    largest_change: float = 0.0
 
 
 class Reference:
@@ -37,7 +25,8 @@ class Reference:
         self._published = open_published(source)
         self.version: str = self._published.config()["version"]
         self._shapes = {name: tuple(shape) for name, _, shape, _ in self._published.tensors()}
-        self._parts: dict[str, _Compared] = {}
+        self._parts: dict[str, PartResemblance] = {}
+        self._cosines: dict[str, list[float]] = {}
         self._different_shapes: list[str] = []
         self._absent: list[str] = []
 
@@ -59,32 +48,21 @@ class Reference:
         drawn = one.drawn
         if drawn is not None and drawn.kind == "constant" and np.all(theirs == drawn.scale):
             return  # as in every checkpoint
-        part = self._parts.setdefault(part_of(one.name), _Compared())
+        part = self._parts.setdefault(part_of(one.name), PartResemblance())
         part.compared += 1
         if np.array_equal(one.values, theirs):
             part.identical += 1
         elif one.values.size > 1 and not one.name.endswith((".b", ".bias")) and not is_norm(one.name):
             mine, norm = np.sqrt(dot(one.values, one.values)), np.sqrt(dot(theirs, theirs))
             if mine > 0.0 and norm > 0.0:
-                part.cosines.append(dot(one.values, theirs) / float(mine * norm))
+                cosine = dot(one.values, theirs) / float(mine * norm)
+                self._cosines.setdefault(part_of(one.name), []).append(cosine)
                 difference = one.values - theirs
                 change = np.sqrt(dot(difference, difference)) / norm
                 part.largest_change = max(part.largest_change, float(change))
 
     def resemblance(self) -> Resemblance:
         """What was found, in the order of the parts."""
-        return Resemblance(
-            source=self.source,
-            different_shapes=self._different_shapes,
-            not_in_reference=self._absent,
-            parts={
-                name: PartResemblance(
-                    compared=part.compared,
-                    identical=part.identical,
-                    cosine=spread_of(np.array(part.cosines)),
-                    largest_change=part.largest_change,
-                )
-                for name, part in ((name, self._parts.get(name)) for name in (*PARTS, UNUSED))
-                if part is not None
-            },
-        )
+        for name, cosines in self._cosines.items():
+            self._parts[name].cosine = spread_of(np.array(cosines))
+        return Resemblance(self.source, self._different_shapes, self._absent, in_order(self._parts))

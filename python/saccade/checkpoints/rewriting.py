@@ -154,7 +154,7 @@ def quantize(
     """
     rewrite = _rewrite(source, out, config, force=force, progress=progress, head_only=head_only)
     rewrite["keep_backbone"] = keep_backbone
-    return QuantizeReport(**_paths(_saccade.quantize(rewrite)))
+    return QuantizeReport(**_frozen(_saccade.quantize(rewrite)))
 
 
 def convert(
@@ -177,8 +177,7 @@ def convert(
     under its name when everything is written.
 
     Args:
-        source: As in :func:`quantize`.
-        out: As in :func:`quantize`.
+        source, out, config, force, progress: As in :func:`quantize`.
         adapter: The directory or id of a LoRA adapter that PEFT saved (``adapter_config.json``,
             ``adapter_model.safetensors``). ``W + scaling * B A`` takes the place of each weight ``W`` that it
             adapts, and the tensors of its ``modules_to_save`` take the place of the source's, as by PEFT's
@@ -186,7 +185,6 @@ def convert(
             and rounded to that dtype. The adapter's other files (statistics, processors, lerobot's
             ``config.json``) take the place of the source's; if it has files that describe robots, those of
             the source are left out. A README of the adapter is not copied.
-        config: As in :func:`quantize`.
         embodiment_ids: The embodiments to keep. The layers of the others become zero. They keep their place,
             so that ids keep their numbers and every program that reads the source reads the copy. A note in
             the metadata of the files makes saccade refuse the ids that were removed. The zeros take no disk
@@ -197,8 +195,6 @@ def convert(
         max_shard_bytes: Largest size of a file in bytes. A tensor that is larger gets a file of its own.
             Default: one file if the source has one, else 5 GB.
         head_only: As in :func:`quantize`. Other programs need the tensors outside the head.
-        force: As in :func:`quantize`.
-        progress: As in :func:`quantize`.
 
     Raises:
         FileNotFoundError: ``source`` or the config does not exist.
@@ -216,9 +212,8 @@ def convert(
         rewrite["max_shard_bytes"] = integer("max_shard_bytes", max_shard_bytes)
     ids = optional_integers("embodiment_ids", embodiment_ids)
     dtype_name = None if dtype is None else text("dtype", dtype)
-    found = _paths(_saccade.convert(rewrite, ids, dtype_name, None if folder is None else os.fspath(folder)))
-    kept = found["embodiment_ids"]
-    return ConvertReport(**{**found, "embodiment_ids": None if kept is None else tuple(kept)})
+    place = None if folder is None else os.fspath(folder)
+    return ConvertReport(**_frozen(_saccade.convert(rewrite, ids, dtype_name, place)))
 
 
 def resize(
@@ -248,16 +243,12 @@ def resize(
     Other programs do not read them. In those, r copies have r times the weight of the original.
 
     Args:
-        source: As in :func:`quantize`.
-        out: As in :func:`quantize`.
+        source, out, config, force, progress: As in :func:`quantize`.
         num_future_tokens: The new number. 0 removes all.
         perturbation: Root mean square of noise that is added to the copied tokens (the rows from N on),
             relative to the root mean square of all tokens, so that training can separate them. With noise,
             the copies are not exact.
         seed: Seed of the noise, at least 0.
-        config: As in :func:`quantize`.
-        force: As in :func:`quantize`.
-        progress: As in :func:`quantize`.
 
     Raises:
         FileNotFoundError: ``source`` or the config does not exist.
@@ -273,10 +264,8 @@ def resize(
     except (TypeError, ValueError):
         raise InputError(f"perturbation: expected a number, got {perturbation!r}") from None
     rewrite = _rewrite(source, out, config, force=force, progress=progress)
-    found = _paths(_saccade.resize(rewrite, count, amount, drawn))
-    bias = found["future_key_bias"]
-    found["sources"] = tuple(tuple(group) for group in found["sources"])
-    return ResizeReport(**{**found, "future_key_bias": None if bias is None else tuple(bias)})
+    found = _saccade.resize(rewrite, count, amount, drawn)
+    return ResizeReport(**_frozen({**found, "sources": [tuple(group) for group in found["sources"]]}))
 
 
 def _rewrite(
@@ -319,6 +308,10 @@ def _rewrite(
     }
 
 
-def _paths(written: dict[str, Any]) -> dict[str, Any]:
-    names = ("files", "carried", "left")
-    return {**written, **{name: tuple(Path(path) for path in written[name]) for name in names}}
+def _frozen(written: dict[str, Any]) -> dict[str, Any]:
+    """What the engine wrote, with paths, and tuples in place of lists."""
+    paths = {name: [Path(path) for path in written[name]] for name in ("files", "carried", "left")}
+    return {
+        name: tuple(value) if isinstance(value, list) else value
+        for name, value in {**written, **paths}.items()
+    }

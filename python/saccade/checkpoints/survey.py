@@ -13,9 +13,8 @@ import numpy as np
 
 import saccade._saccade as _saccade
 from saccade._internal.arrays import Float32Array
-from saccade.checkpoints.findings import Embodiment, Part
+from saccade.checkpoints.findings import UNUSED, Embodiment, Part, in_order, part_of
 from saccade.checkpoints.initialisation import Draw, draw, is_as_drawn, is_norm, sample
-from saccade.checkpoints.parts import UNUSED, in_order, part_of
 from saccade.head.config import HeadConfig
 
 #: A median absolute deviation times this is the standard deviation of normally distributed numbers.
@@ -43,7 +42,7 @@ class Survey:
     Args:
         published: The open checkpoint.
         head: Its config.
-        examine: Called with each of them.
+        examine: Called with each of them, unless it is None.
         progress: Called with the number of bytes that are done and the total number of bytes.
 
     Attributes:
@@ -55,7 +54,7 @@ class Survey:
         self,
         published: _saccade.Published,
         head: HeadConfig,
-        examine: Callable[[Slice], object],
+        examine: Callable[[Slice], object] | None,
         progress: Callable[[int, int], object] | None,
     ) -> None:
         self._published = published
@@ -79,7 +78,8 @@ class Survey:
             part.dtypes[dtype] = part.dtypes.get(dtype, 0) + 1
             judged = []
             for one in self._slices(name, dtype, tuple(shape)):
-                examine(one)
+                if examine is not None:
+                    examine(one)
                 judged.append(self._judge(one))
             if judged and None not in judged:
                 part.judged += 1

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -25,17 +25,17 @@ class RobotFindings:
 
     embodiment: str | None
     """Its tag."""
-    embodiment_id: int | None
+    embodiment_id: int | None = None
     """Its id in the head."""
-    needs: Requirements | None
+    needs: Requirements | None = None
     """What an observation of it must contain; None if the statistics cannot be used as they are."""
-    actions: tuple[tuple[str, int], ...]
+    actions: tuple[tuple[str, int], ...] = ()
     """Key and width of each part of the action."""
-    problem: str | None
+    problem: str | None = None
     """Why the statistics cannot be used as they are."""
-    warning: str | None
+    warning: str | None = None
     """What is not known about them, although they can be used."""
-    data_config: str | None
+    data_config: str | None = None
     """The data config that was given, as text; None for none, or where the files say it."""
 
 
@@ -43,39 +43,35 @@ class RobotFindings:
 class BackboneFindings:
     """The backbone of a checkpoint, and what is needed to use it."""
 
-    config: BackboneConfig | None
+    config: BackboneConfig | None = None
     """Its sizes; None if it is not one that saccade loads."""
-    problem: str | None
+    problem: str | None = None
     """Why it is not."""
-    memory: dict[str, int]
+    memory: dict[str, int] = field(default_factory=dict)
     """Size of the loaded weights by precision, in bytes."""
-    processor: str | None
+    processor: str | None = None
     """How frames and words are prepared by default; None if something is missing."""
-    processor_problem: str | None
+    processor_problem: str | None = None
     """What is missing: which files of which published id are needed."""
 
 
 def backbone_of(source: Path, config: str | None) -> BackboneFindings:
     """The backbone of a checkpoint that has tensors outside its head. Reads no tensor.
 
-    Args:
-        source: The checkpoint.
-        config: Its config as JSON, or None for its ``config.json``.
+    ``config`` is JSON, or None for the checkpoint's ``config.json``.
     """
     try:
         published = _saccade.PublishedBackbone.open(str(source), config)
     except SaccadeError as error:
-        return BackboneFindings(None, str(error), {}, None, None)
+        return BackboneFindings(problem=str(error))
     processor, problem = None, None
     try:
-        processor = (
-            repr(Processor.from_pretrained(source)).removeprefix("<saccade.Processor ").removesuffix(">")
-        )
+        shown = repr(Processor.from_pretrained(source))
+        processor = shown.removeprefix("<saccade.Processor ").removesuffix(">")
     except (SaccadeError, FileNotFoundError) as error:
         problem = str(error)
     return BackboneFindings(
         config=BackboneConfig(**published.config()),
-        problem=None,
         memory={precision: published.nbytes(precision) for precision in PRECISIONS},
         processor=processor,
         processor_problem=problem,
@@ -87,15 +83,12 @@ def robots_of(
 ) -> list[RobotFindings]:
     """The robots whose statistics a checkpoint holds, with what an observation of each must contain.
 
-    Args:
-        source: The checkpoint.
-        state_history: Number of states that its head takes.
-        data_config: As for :meth:`saccade.Normalizer.from_pretrained`; used for the robots of N1 and N1.5.
+    ``state_history`` is the number of states that its head takes.
     """
     try:
         tags = _tags(source)
     except (OSError, SaccadeError) as error:
-        return [RobotFindings(None, None, None, (), str(error), None, None)]
+        return [RobotFindings(None, problem=str(error))]
     return [_robot_of(source, tag, state_history, data_config) for tag in tags]
 
 
@@ -109,7 +102,7 @@ def _robot_of(
             normalizer = Normalizer.from_pretrained(source, tag, data_config=data_config)
             needs = read_requirements(source, normalizer)
         except (SaccadeError, FileNotFoundError) as error:
-            return RobotFindings(tag, None, None, (), str(error), None, None)
+            return RobotFindings(tag, problem=str(error))
     needs = replace(needs, state_history=normalizer.state_history or state_history)
     actions = tuple((group.key, group.size) for group in normalizer.action_groups)
     warning = str(caught[0].message) if caught else None
