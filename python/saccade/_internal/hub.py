@@ -147,11 +147,7 @@ def locate_published(
 def _from_cache(
     name: str, revision: str, files: tuple[str, ...], argument: str, offline: Offline
 ) -> Location:
-    """The commit that the cache has for a revision.
-
-    Raises:
-        FileNotFoundError: It has none, or files of it are missing.
-    """
+    """The commit that the cache has for a revision, if it has all files that are needed."""
     shown = _shown(name, revision)
     start = f"{argument}: {shown}: no such path{neighbour(name)}, {offline.reason}, and "
     command = f"hf download {name}" + ("" if revision == DEFAULT_REVISION else f" --revision {revision}")
@@ -176,11 +172,7 @@ def _from_cache(
 
 
 def _check_cached_folder(path: Path, files: tuple[str, ...], argument: str) -> None:
-    """Checks a path that is the folder of a commit in the cache, as :func:`resolve` returns it.
-
-    Raises:
-        FileNotFoundError: Files were not downloaded, because a call before did not need them.
-    """
+    """Checks a path that is the folder of a commit in the cache, where files may be missing."""
     listed = hub_cache.read_listing(path) if path.parent.name == "snapshots" else None
     missing = [] if listed is None else missing_files(path, files, listed)
     if missing:

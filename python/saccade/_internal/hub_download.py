@@ -63,10 +63,7 @@ def list_files(name: str, revision: str, argument: str) -> tuple[str, list[str]]
 
 
 def download(name: str, commit: str, files: tuple[str, ...], listed: list[str], argument: str) -> Path:
-    """Downloads those files ``listed`` of a commit that match ``files`` and are not in the cache yet.
-
-    Returns:
-        The directory of the commit in the cache.
+    """Downloads the files that match into the cache, and returns the directory of the commit there.
 
     Raises:
         FileNotFoundError: The download stopped before its end.

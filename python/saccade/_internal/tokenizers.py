@@ -15,13 +15,9 @@ from saccade._internal.warning import warn
 def tokenizer_path(
     id_or_path: str | os.PathLike[str], tokenizer: str | os.PathLike[str] | None = None
 ) -> Path | None:
-    """Where :meth:`saccade.Processor.from_pretrained` finds the tokenizer, if that is outside the checkpoint.
+    """The file or directory of the tokenizer that :meth:`saccade.Processor.from_pretrained` reads.
 
-    Args:
-        id_or_path, tokenizer: As in :meth:`saccade.Processor.from_pretrained`, which lists the errors.
-
-    Returns:
-        A file or a directory. None if the checkpoint has a tokenizer and no other is requested.
+    None if that is the checkpoint's own, because no other is requested.
     """
     found = tokenizer_of(processor_source(id_or_path, None), tokenizer)
     return None if found is None else Path(found)

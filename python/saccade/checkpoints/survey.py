@@ -89,9 +89,8 @@ class Survey:
                 progress(done, total)
 
     def _slices(self, name: str, dtype: str, shape: tuple[int, ...]) -> Iterator[Slice]:
-        drawn = None if dtype == "I8" or part_of(name) == UNUSED else draw(name, self._inputs(name, shape))
-        if name.endswith("_scale"):
-            drawn = None
+        is_drawn = dtype != "I8" and part_of(name) != UNUSED and not name.endswith("_scale")
+        drawn = draw(name, self._inputs(name, shape)) if is_drawn else None
         is_category = name.endswith((".W", ".b"))
         indices: list[int | None] = list(range(shape[0])) if is_category else [None]
         for index in indices:
