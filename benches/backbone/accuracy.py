@@ -14,8 +14,8 @@ import numpy as np
 from benches.backbone import setup
 from benches.checkpoints import written
 from saccade._internal.arrays import Float32Array
-from saccade.checkpoints.published import CONFIGS, RELEASED
 from saccade_lab import random_checkpoint
+from saccade_lab.published import CONFIGS, RELEASED
 
 MODELS = {"plain": False, "outliers": True}
 

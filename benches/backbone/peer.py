@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from transformers import Qwen3Config, Qwen3Model, SiglipVisionConfig, SiglipVisionModel
 
 from saccade import BackboneInputs
-from saccade.checkpoints.backbone_sizes import BackboneSizes
+from saccade_lab.backbone_sizes import BackboneSizes
 
 PREFIX = "backbone.eagle_model."
 

@@ -11,7 +11,7 @@ from benches.backbone import memory, reuse
 from benches.backbone.work import backbone_work, floor_seconds
 from benches.peers.results import TOLERANCE
 from benches.peers.text import plural, table
-from saccade.checkpoints.backbone_sizes import BackboneSizes
+from saccade_lab.backbone_sizes import BackboneSizes
 from saccade_lab.timing import Machine, quartiles
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "results" / "backbone.md"

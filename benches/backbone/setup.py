@@ -10,7 +10,7 @@ import numpy as np
 
 from saccade import BackboneInputs
 from saccade._internal.arrays import Float32Array
-from saccade.checkpoints.backbone_sizes import BackboneSizes
+from saccade_lab.backbone_sizes import BackboneSizes
 from saccade_lab.random_checkpoint.tokenizer import FIRST_ADDED, WORDS, token_id
 
 #: Words of the prompt around the views, as N1.5's template puts them; "Ċ" is a new line.

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 
 from benches.cost import ELEMENT_BYTES
 from benches.work import Work, Works, add_linear
-from saccade.checkpoints.backbone_sizes import BackboneSizes
+from saccade_lab.backbone_sizes import BackboneSizes
 from saccade_lab.timing import Machine
 
 #: Parts whose operands are keys, values and probabilities rather than weights.

@@ -9,8 +9,8 @@ import pytest
 import torch
 
 import saccade
-from saccade.checkpoints.backbone_sizes import BackboneSizes
-from saccade.checkpoints.published import RELEASED
+from saccade_lab.backbone_sizes import BackboneSizes
+from saccade_lab.published import RELEASED
 from saccade_lab.reference import Backbone
 from tests.helpers.reference_backbone_cases import config_of, random_inputs, random_sizes, randomised
 

@@ -16,8 +16,8 @@ from benches.backbone import __main__ as program
 from benches.backbone import accuracy, memory, peer, report, setup
 from benches.backbone.work import backbone_work, floor_seconds
 from benches.work import total
-from saccade.checkpoints.backbone_sizes import BackboneSizes
 from saccade_lab import random_checkpoint
+from saccade_lab.backbone_sizes import BackboneSizes
 from saccade_lab.reference import Backbone
 from saccade_lab.timing import Machine
 

@@ -14,8 +14,8 @@ from torch import Tensor, nn
 
 import saccade
 from saccade import BackboneInputs, InputError
-from saccade.checkpoints.backbone_sizes import BackboneSizes
-from saccade.checkpoints.published import RELEASED
+from saccade_lab.backbone_sizes import BackboneSizes
+from saccade_lab.published import RELEASED
 from saccade_lab.random_checkpoint import small_backbone, small_head, write
 from saccade_lab.random_checkpoint import tensors as random_tensors
 from saccade_lab.random_checkpoint.__main__ import main

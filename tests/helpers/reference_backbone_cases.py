@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from saccade import BackboneInputs
-from saccade.checkpoints.backbone_sizes import BackboneSizes, TextSizes, VisionSizes
+from saccade_lab.backbone_sizes import BackboneSizes, TextSizes, VisionSizes
 from saccade_lab.reference import Backbone
 
 # Small tensors gain nothing from threads, and on a busy machine every barrier between them stalls.

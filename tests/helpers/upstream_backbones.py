@@ -21,7 +21,7 @@ from transformers.models.qwen3_vl.configuration_qwen3_vl import Qwen3VLConfig
 from transformers.models.qwen3_vl.modeling_qwen3_vl import Qwen3VLForConditionalGeneration
 
 from saccade import BackboneInputs
-from saccade.checkpoints.backbone_sizes import BackboneSizes
+from saccade_lab.backbone_sizes import BackboneSizes
 from saccade_lab.reference.lerobot_backbone import eagle, text_config
 
 EAGLE = "lerobot.policies.groot.eagle2_hg_model"

@@ -24,7 +24,7 @@ from benches.backbone.setup import sizes_of
 from benches.peers import inputs, pieces
 from benches.peers.engines import Built, Task
 from benches.peers.policy_inputs import VIEWS, Arrays, given
-from saccade.checkpoints.backbone_sizes import BackboneSizes
+from saccade_lab.backbone_sizes import BackboneSizes
 from saccade_lab.reference import ActionHead, Backbone
 from saccade_lab.reference.backbone.attention import split_heads
 from saccade_lab.reference.backbone.rotary import rotate, text_angles

@@ -16,8 +16,8 @@ import argparse
 import sys
 from pathlib import Path
 
-from saccade.checkpoints.published import RELEASED
 from saccade.errors import InputError
+from saccade_lab.published import RELEASED
 from saccade_lab.random_checkpoint.whole import small_backbone, small_head, write
 
 

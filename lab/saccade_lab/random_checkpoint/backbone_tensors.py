@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from saccade.checkpoints.backbone_sizes import BackboneSizes
+from saccade_lab.backbone_sizes import BackboneSizes
 
 Shapes = Iterator[tuple[str, tuple[int, ...]]]
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import saccade._saccade as _saccade
 from saccade._internal.files import write_json
-from saccade.checkpoints.published import sized_config, small_config, whole_config
+from saccade_lab.published import sized_config, small_config, whole_config
 from saccade_lab.random_checkpoint.tensors import Tensor, write_file
 
 #: The sizes of :func:`config_of_size`.

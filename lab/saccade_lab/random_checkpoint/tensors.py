@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from saccade._internal.arrays import Float32Array
-from saccade.checkpoints.backbone_sizes import BackboneSizes
+from saccade_lab.backbone_sizes import BackboneSizes
 
 #: Numbers that are drawn at a time.
 BLOCK = 1 << 22

@@ -12,10 +12,10 @@ import numpy as np
 
 import saccade._saccade as _saccade
 from saccade._internal.files import write_json
-from saccade.checkpoints.backbone_sizes import BackboneSizes, eagle_config, merged
-from saccade.checkpoints.published import CONFIGS, RELEASED, small_config, whole_config
 from saccade.errors import InputError
 from saccade.robots.data_configs import LANGUAGE_KEY
+from saccade_lab.backbone_sizes import BackboneSizes, eagle_config, merged
+from saccade_lab.published import CONFIGS, RELEASED, small_config, whole_config
 from saccade_lab.random_checkpoint.backbone_tensors import tensor_shapes, unread_tensor_shapes
 from saccade_lab.random_checkpoint.robot_metadata import metadata
 from saccade_lab.random_checkpoint.tensors import Outliers, Tensor, write_file
@@ -94,7 +94,7 @@ def write(
     Args:
         folder: Where; made if it does not exist, and otherwise empty.
         version: ``"n1.5"``, ``"n1.6"`` or ``"n1.7"``.
-        backbone: Config with the keys of :data:`saccade.checkpoints.published.RELEASED`, or those of it
+        backbone: Config with the keys of :data:`saccade_lab.published.RELEASED`, or those of it
             that differ. Default: the published sizes.
         head: Config of the head in the released keys, for features as wide as the backbone's. Default: the
             published sizes.

@@ -7,7 +7,7 @@ from typing import Any
 
 from transformers import Qwen3Config, Qwen3ForCausalLM, SiglipVisionConfig, SiglipVisionModel
 
-from saccade.checkpoints.backbone_sizes import BackboneSizes
+from saccade_lab.backbone_sizes import BackboneSizes
 
 
 def eagle(module: ModuleType, sizes: BackboneSizes) -> Any:

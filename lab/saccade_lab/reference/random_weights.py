@@ -10,8 +10,8 @@ import torch
 from safetensors.torch import save_file
 from torch import Tensor
 
-from saccade.checkpoints.published import CONFIGS, sized_config, small_config, whole_config
 from saccade.head.config import HeadConfig
+from saccade_lab.published import CONFIGS, sized_config, small_config, whole_config
 from saccade_lab.reference.head import ActionHead
 
 __all__ = [

@@ -11,11 +11,11 @@ import numpy as np
 import numpy.typing as npt
 
 from saccade._internal.files import write_json
-from saccade.checkpoints.backbone_sizes import BackboneSizes, eagle_config
 from saccade.errors import CheckpointError
 from saccade.head.config import HeadConfig
 from saccade.processor import Processor
 from saccade.robots import LANGUAGE_KEY, Normalizer
+from saccade_lab.backbone_sizes import BackboneSizes, eagle_config
 from saccade_lab.random_checkpoint.robot_metadata import metadata
 from saccade_lab.random_checkpoint.tokenizer import token_id, tokenizer
 from saccade_lab.sim.cameras import CameraPose
@@ -107,7 +107,7 @@ class PolicyConfig:
 
     Attributes:
         head: Config of the head, in the published keys.
-        backbone: Config of the backbone, in the keys of ``saccade.checkpoints.published.RELEASED``.
+        backbone: Config of the backbone, in the keys of ``saccade_lab.published.RELEASED``.
         simulation: How it is run in the simulator.
         words: Words that are one token each.
         statistics: Statistics of ``state`` and ``action``, by group, see ``statistics_of``; empty before the

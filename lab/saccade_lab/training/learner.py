@@ -14,8 +14,8 @@ from torch import Tensor, nn
 from torch.func import functional_call
 
 from saccade.backbone.inputs import BackboneInputs
-from saccade.checkpoints.backbone_sizes import BackboneSizes
 from saccade.head.config import HeadConfig
+from saccade_lab.backbone_sizes import BackboneSizes
 from saccade_lab.reference import ActionHead, Backbone
 from saccade_lab.reference.backbone import BackboneFeatures
 from saccade_lab.reference.layers import TABLE_STD, CategoryLinear

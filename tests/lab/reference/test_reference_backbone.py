@@ -16,8 +16,8 @@ from safetensors.torch import save_file
 from torch import Tensor, nn
 
 from saccade import BackboneInputs, CheckpointError, InputError, ShapeError
-from saccade.checkpoints.backbone_sizes import BackboneSizes
-from saccade.checkpoints.published import RELEASED
+from saccade_lab.backbone_sizes import BackboneSizes
+from saccade_lab.published import RELEASED
 from saccade_lab.random_checkpoint import backbone_tensors
 from saccade_lab.reference import Backbone, BackboneFeatures
 from saccade_lab.reference.backbone.loading import is_unread

@@ -13,8 +13,8 @@ import torch
 from safetensors import safe_open
 from torch import Tensor
 
-from saccade.checkpoints.backbone_sizes import BackboneSizes
 from saccade.errors import CheckpointError
+from saccade_lab.backbone_sizes import BackboneSizes
 
 #: Prefixes of the names of a backbone's tensors, in checkpoints by NVIDIA and by lerobot.
 PREFIXES = ("backbone.", "_groot_model.backbone.")

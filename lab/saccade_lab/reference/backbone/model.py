@@ -20,8 +20,8 @@ from torch import Tensor, nn
 from saccade._internal.hub import resolve
 from saccade._internal.hub_files import BACKBONE
 from saccade.backbone.inputs import BackboneInputs
-from saccade.checkpoints.backbone_sizes import BackboneSizes
 from saccade.errors import InputError, ShapeError
+from saccade_lab.backbone_sizes import BackboneSizes
 from saccade_lab.reference.backbone import loading
 from saccade_lab.reference.backbone.qwen3 import Decoder, LanguageModel
 from saccade_lab.reference.backbone.qwen3_vl import VisionTower, prompt_positions
@@ -95,7 +95,7 @@ class Backbone(nn.Module):
             id_or_path: A directory or a file in any layout that
                 :meth:`saccade.Backbone.from_pretrained` reads, or the id of a published checkpoint.
             revision: A branch, tag or commit of the id. Default: ``main``.
-            config: As for :meth:`saccade.checkpoints.backbone_sizes.BackboneSizes.from_config`, or the path
+            config: As for :meth:`saccade_lab.backbone_sizes.BackboneSizes.from_config`, or the path
                 of such a file. Default: the ``config.json`` in the same directory, or else the ``about``
                 entry in the metadata of a single file.
             dtype: Dtype of the parameters. Narrower stored dtypes are widened, which is exact.

@@ -12,7 +12,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from saccade.checkpoints.backbone_sizes import TextSizes
+from saccade_lab.backbone_sizes import TextSizes
 from saccade_lab.reference.backbone.attention import attend, split_heads
 from saccade_lab.reference.backbone.rotary import rotate
 

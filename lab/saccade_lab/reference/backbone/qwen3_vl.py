@@ -10,8 +10,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from saccade.checkpoints.backbone_sizes import BackboneSizes, VisionSizes
 from saccade.errors import InputError
+from saccade_lab.backbone_sizes import BackboneSizes, VisionSizes
 from saccade_lab.reference.backbone.attention import attend, split_heads
 from saccade_lab.reference.backbone.rotary import grid_angles, rotate
 

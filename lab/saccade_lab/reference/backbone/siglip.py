@@ -9,7 +9,7 @@ Shapes in comments: V are the views, P the patches of a view.
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from saccade.checkpoints.backbone_sizes import VisionSizes
+from saccade_lab.backbone_sizes import VisionSizes
 from saccade_lab.reference.backbone.attention import attend, split_heads
 
 

@@ -10,8 +10,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from saccade.checkpoints.published import RELEASED
 from saccade.errors import CheckpointError
+from saccade_lab.published import RELEASED
 
 #: ``model_type`` of a checkpoint's config, and the version of its backbone.
 MODEL_TYPES: Mapping[str, str] = {"gr00t_n1_5": "n1.5", "Gr00tN1d6": "n1.6", "Gr00tN1d7": "n1.7"}
