@@ -1,4 +1,7 @@
-"""Checks that the observation formats share: frames, states, instructions, batch axes."""
+"""Checks that the observation formats share: frames, states, instructions, batch axes.
+
+What does not fit is refused with an InputError, ShapeError or DtypeError, which lists what the robot needs.
+"""
 
 from __future__ import annotations
 
@@ -23,16 +26,8 @@ def find_cameras(
 ) -> list[tuple[Camera, str]]:
     """The cameras of an observation in the order of the prompt, each with the name that it has there.
 
-    Cameras that the robot does not need are left out, unless it takes extra ones.
-
-    Args:
-        prefix: What the keys of cameras begin with, for messages.
-        given: The cameras of the observation, without prefix.
-        needs: What the robot needs.
-        sort: Whether cameras that the checkpoint does not name are sorted by name.
-
-    Raises:
-        InputError: A camera is missing, or there is none.
+    Cameras that the robot does not need are left out, unless it takes extra ones. With ``sort``, cameras that
+    the checkpoint does not name are sorted by name.
     """
     names = list(given)
     chosen, missing = [], []
@@ -56,11 +51,7 @@ def find_cameras(
 
 
 def on_cpu(name: str, value: Any, needs: Requirements) -> Any:
-    """A torch tensor without its gradient, or anything else as it is.
-
-    Raises:
-        DtypeError: A tensor is on another device.
-    """
+    """A torch tensor without its gradient, or anything else as it is."""
     if not is_torch(value):
         return value
     if value.device.type != "cpu":
@@ -71,18 +62,7 @@ def on_cpu(name: str, value: Any, needs: Requirements) -> Any:
 def check_frames(
     name: str, frames: Any, axes: tuple[int, ...], camera: Camera, needs: Requirements
 ) -> UInt8Array:
-    """Frames of one camera, with colours last.
-
-    Args:
-        name: The key, for messages.
-        frames: uint8, with three colours in the last axis.
-        axes: The numbers of axes that they may have, those of batch and time included.
-        camera: The camera.
-        needs: What the robot needs.
-
-    Raises:
-        ShapeError, DtypeError: They do not fit.
-    """
+    """Frames of one camera, uint8 with colours last; ``axes`` are the numbers of axes that they may have."""
     shape = f"uint8 of {' or '.join(map(str, axes))} axes that end in (height, width, 3)"
     frames = on_cpu(name, frames, needs)
     if is_torch(frames):
@@ -101,28 +81,8 @@ def check_frames(
     return frames
 
 
-def check_horizons(
-    prefix: str, horizons: Mapping[str, int], expected: int | None, needs: Requirements
-) -> None:
-    """Checks the number of frames of each camera.
-
-    Raises:
-        ShapeError: It is not the expected one, or not the same everywhere.
-    """
-    wrong = [name for name, horizon in horizons.items() if expected not in (None, horizon)]
-    if wrong or len(set(horizons.values())) > 1:
-        keys = ", ".join(prefix + name for name in wrong) or f"{prefix}*"
-        listed = ", ".join(f"{name} {horizon}" for name, horizon in horizons.items())
-        wanted = "as many of every camera" if expected is None else str(expected)
-        raise needs.shape_error(f"{keys}: frames along the time axis", wanted, listed)
-
-
 def shape_of(name: str, value: Any, needs: Requirements) -> tuple[int, ...]:
-    """The shape of an array, a tensor or a nested list.
-
-    Raises:
-        ShapeError: It is a ragged list.
-    """
+    """The shape of an array, a tensor or a nested list."""
     try:
         return tuple(value.shape) if hasattr(value, "shape") else np.shape(value)
     except (TypeError, ValueError):
@@ -130,20 +90,7 @@ def shape_of(name: str, value: Any, needs: Requirements) -> tuple[int, ...]:
 
 
 def check_state(name: str, state: Any, axes: int, parts: StateParts, needs: Requirements) -> Float32Array:
-    """One part of the state, or several side by side: ``(..., width)`` of ``axes`` axes.
-
-    Integers are taken if float32 holds them exactly.
-
-    Args:
-        name: The key, for messages.
-        state: The numbers: an array, a tensor or nested lists.
-        axes: The number of axes, those of batch and time included.
-        parts: Key and width of each part.
-        needs: What the robot needs.
-
-    Raises:
-        ShapeError, DtypeError, InputError: It does not fit or is not finite.
-    """
+    """One part of the state, or several side by side: ``(..., width)`` of ``axes`` axes."""
     width = sum(size for _, size in parts)
     shape_of(name, state, needs)
     try:
@@ -169,25 +116,29 @@ def _not_finite(values: Float32Array, parts: StateParts) -> str:
     return f"{columns} ({', '.join(dict.fromkeys(keys[column] for column in bad))})"
 
 
-def check_batch(sizes: Mapping[str, int], needs: Requirements) -> int:
-    """The batch size that all parts of an observation have.
-
-    Raises:
-        ShapeError: They differ.
-    """
+def check_batch(sizes: Mapping[str, int], needs: Requirements) -> None:
+    """Checks that all parts of an observation have the same batch size."""
     if len(set(sizes.values())) != 1:
         listed = ", ".join(f"{name} {size}" for name, size in sizes.items())
         raise needs.shape_error("observation", "the same batch size everywhere", listed)
-    return next(iter(sizes.values()))
 
 
-def views(cameras: Sequence[Camera], frames: Mapping[str, UInt8Array]) -> tuple[dict[str, UInt8Array], ...]:
-    """The views of each observation, from frames ``(batch, time, height, width, 3)`` by camera."""
-    ordered = {camera.name: frames[camera.name] for camera in cameras}
-    places = view_places(ordered)
+def views(
+    prefix: str, frames: Mapping[str, UInt8Array], horizon: int | None, needs: Requirements
+) -> tuple[dict[str, UInt8Array], ...]:
+    """The views of each row, from frames ``(batch, time, height, width, 3)`` by camera."""
+    horizons = {name: found.shape[1] for name, found in frames.items()}
+    wrong = [name for name, found in horizons.items() if horizon not in (None, found)]
+    if wrong or len(set(horizons.values())) > 1:
+        keys = ", ".join(prefix + name for name in wrong) or f"{prefix}*"
+        listed = ", ".join(f"{name} {found}" for name, found in horizons.items())
+        wanted = "as many of every camera" if horizon is None else str(horizon)
+        raise needs.shape_error(f"{keys}: frames along the time axis", wanted, listed)
+    check_batch({f"{prefix}{name}": len(found) for name, found in frames.items()}, needs)
+    places = view_places(frames)
     return tuple(
         {view: frames[name][row, time] for view, (name, time) in places.items()}
-        for row in range(len(frames[cameras[0].name]))
+        for row in range(len(next(iter(frames.values()))))
     )
 
 
@@ -209,12 +160,15 @@ def view_places(frames: Mapping[str, Any]) -> dict[str, tuple[str, int]]:
     }
 
 
-def as_text(name: str, value: Any, needs: Requirements) -> str:
-    """One instruction.
+def as_list(value: Any) -> Any:
+    """Lists, tuples and arrays as a list; anything else, and an array without axes, as what it is."""
+    if isinstance(value, np.ndarray):
+        return value.tolist()
+    return list(value) if isinstance(value, (list, tuple)) else value
 
-    Raises:
-        InputError: It is not a string, or not valid Unicode.
-    """
+
+def as_text(name: str, value: Any, needs: Requirements) -> str:
+    """One instruction."""
     if not isinstance(value, str):
         raise needs.input_error(name, "an instruction", repr(value))
     try:
@@ -225,16 +179,7 @@ def as_text(name: str, value: Any, needs: Requirements) -> str:
 
 
 def default_instructions(name: str, count: int, needs: Requirements) -> tuple[None, ...]:
-    """The released default for this many observations, with a warning.
-
-    Args:
-        name: The key under which there is no instruction.
-        count: The number of observations.
-        needs: What the robot needs.
-
-    Raises:
-        InputError: The release has no default.
-    """
+    """The released default for this many observations, with a warning, where the release has one."""
     if needs.requires_language:
         raise needs.input_error(name, "an instruction", "none")
     warn(f"{name}: there is no instruction; the released default is used")

@@ -9,10 +9,10 @@ import numpy as np
 
 from saccade._internal.arrays import Array, Float32Array, UInt8Array, is_torch, like_features
 from saccade.observations.checks import (
+    as_list,
     as_text,
     check_batch,
     check_frames,
-    check_horizons,
     check_state,
     default_instructions,
     find_cameras,
@@ -78,11 +78,7 @@ class Lerobot:
 
 
 def _renamed(observation: Mapping[str, Any], needs: Requirements) -> Mapping[str, Any]:
-    """The observation after the checkpoint's step that renames keys. Keys that it does not name stay.
-
-    Raises:
-        InputError: Two keys get one name. In lerobot the later one counts, whatever their order means.
-    """
+    """The observation with its keys renamed. In lerobot the later of two keys of one name counts."""
     if not needs.rename_map:
         return observation
     names, found = dict(needs.rename_map), {}
@@ -99,17 +95,14 @@ def _frames(observation: Mapping[str, Any], needs: Requirements) -> tuple[dict[s
     given = {key.removeprefix(IMAGES): key for key in observation if key.startswith(IMAGES.rstrip("."))}
     if not given and IMAGE in observation:
         given = {"image": IMAGE}
-    cameras = find_cameras(IMAGES, given, needs, sort=True)
     frames = {}
-    for camera, name in cameras:
+    for camera, name in find_cameras(IMAGES, given, needs, sort=True):
         key = given[name]
         found = check_frames(key, _uint8(key, observation[key], needs), (3, 4, 5), camera, needs)
         if found.ndim == 3:
             found = found[None]
         frames[camera.name] = _aligned(found[:, None] if found.ndim == 4 else found, needs.video_horizon)
-    check_horizons(IMAGES, {name: found.shape[1] for name, found in frames.items()}, None, needs)
-    check_batch({f"{IMAGES}{name}": len(found) for name, found in frames.items()}, needs)
-    return views([camera for camera, _ in cameras], frames)
+    return views(IMAGES, frames, None, needs)
 
 
 def _aligned(frames: UInt8Array, horizon: int | None) -> UInt8Array:
@@ -149,18 +142,14 @@ def _from_unit(name: str, frames: Any, needs: Requirements) -> Any:
 
 def _texts(given: Any, count: int, needs: Requirements) -> tuple[str | None, ...]:
     """The instruction of each row. One is for every row. None or an empty one is the released default."""
-    if isinstance(given, np.ndarray):
-        given = given.tolist()
-    if given is None or isinstance(given, str):
-        rows: list[Any] = [given]
-    elif isinstance(given, (list, tuple)):
-        rows = list(given) or [None]
-    else:
+    given = as_list(given)
+    rows = (given or [None]) if isinstance(given, list) else [given]
+    if given is not None and not isinstance(given, (list, str)):
         raise needs.input_error(TASK, "an instruction, or one for each row", repr(given))
     # Isaac-GR00T takes an empty text as it is where it has no default.
-    is_default = [row is None or (isinstance(row, str) and not row) for row in rows]
-    if needs.requires_language:
-        is_default = [row is None for row in rows]
+    is_default = [
+        row is None or (isinstance(row, str) and not row and not needs.requires_language) for row in rows
+    ]
     if any(is_default):
         default_instructions(TASK, count, needs)
     texts = [

@@ -135,38 +135,26 @@ def read_frames(
     return found
 
 
-def observation_folders(directory: Path, policy: ObservingPolicy) -> list[Path]:
-    """The folders of a directory that are observations, see :func:`read_frames`.
-
-    Raises:
-        InputError: There is none, or a folder has both pictures and folders.
-    """
-
-    def below(folder: Path, levels: int) -> list[Path]:
-        pictures, inside = contents_of(folder)
-        if pictures and inside:
-            raise InputError(
-                f"{folder}: expected pictures or folders of pictures, got pictures and the folder "
-                f"{inside[0].name}"
-            )
-        if pictures:
-            return [folder]
-        if not inside or not levels:
-            raise InputError(
-                f"{folder}: expected pictures named after the cameras ({example_names(policy)}), or a folder "
-                "of them for each observation, got no pictures"
-            )
-        return [found for one in inside for found in below(one, levels - 1)]
-
-    return below(directory, 2)
+def observation_folders(folder: Path, policy: ObservingPolicy, levels: int = 2) -> list[Path]:
+    """The folders in a folder, or itself, that are observations; ``levels`` of folders are looked into."""
+    pictures, inside = contents_of(folder)
+    if pictures and inside:
+        raise InputError(
+            f"{folder}: expected pictures or folders of pictures, got pictures and the folder "
+            f"{inside[0].name}"
+        )
+    if pictures:
+        return [folder]
+    if not inside or not levels:
+        raise InputError(
+            f"{folder}: expected pictures named after the cameras ({example_names(policy)}), or a folder "
+            "of them for each observation, got no pictures"
+        )
+    return [found for one in inside for found in observation_folders(one, policy, levels - 1)]
 
 
 def pictures_in(folder: Path, policy: ObservingPolicy) -> dict[str, Path]:
-    """The picture of each camera in a folder, in the order of the prompt.
-
-    Raises:
-        InputError: A picture is missing, or of no camera, or a camera has two.
-    """
+    """The picture of each camera in a folder, in the order of the prompt."""
     given, _ = contents_of(folder)
     by_name: dict[str, Path] = {}
     for path in given:
@@ -201,12 +189,7 @@ def contents_of(folder: Path) -> tuple[list[Path], list[Path]]:
 
 
 def by_number(path: Path) -> list[tuple[int, str]]:
-    """A key that sorts numbers in names by their size.
-
-    Example:
-        >>> [path.name for path in sorted([Path("step10"), Path("step9"), Path("a")], key=by_number)]
-        ['a', 'step9', 'step10']
-    """
+    """A key that sorts numbers in names by their size: step9 before step10."""
     parts = re.split(r"([0-9]+)", path.name)
     return [(int(part), "") if index % 2 else (0, part) for index, part in enumerate(parts)]
 
@@ -218,13 +201,11 @@ def observation(
 
     Args:
         policy: The policy that is to accept it.
-        pictures: Files by camera. The name may be empty if there is one camera. Without any: random frames.
+        pictures: Files by camera. The name may be empty if there is one camera.
         instruction: The instruction, or None.
-        state: What :func:`read_state` returned, or None. What is None is that of
-            :meth:`saccade.Policy.example_observation`.
+        state: What :func:`read_state` returned, or None.
 
-    Raises:
-        FileNotFoundError, InputError: A picture cannot be read, or a list of the state is too short or long.
+    What is not given is that of :meth:`saccade.Policy.example_observation`.
     """
     given = policy.example_observation()
     if pictures:
@@ -257,37 +238,24 @@ def instruction_of(given: Mapping[str, Any]) -> str:
 
 
 def read_state(path: Path) -> Any:
-    """The state in a JSON file: numbers by key, ``{"arm": [0, 0.1], "hand": [1]}``, or one list of all.
-
-    Raises:
-        FileNotFoundError: There is no such file.
-        InputError: It contains something else.
-    """
+    """The state in a JSON file: numbers by key, ``{"arm": [0, 0.1], "hand": [1]}``, or one list of all."""
     try:
         values = json.loads(path.read_text(encoding="utf-8"))
     except (ValueError, RecursionError) as error:
         raise InputError(f"{path}: cannot be read as JSON: {error}") from None
     rows = list(values.values()) if isinstance(values, dict) else [values]
-    if not rows or not all(is_numbers(row) for row in rows):
+    if not rows or not all(_is_numbers(row) for row in rows):
         raise InputError(f"{path}: expected lists of numbers by key, or one list of numbers")
     return values
 
 
-def is_numbers(row: Any) -> bool:
+def _is_numbers(row: Any) -> bool:
     """Whether a value of JSON is a list of numbers that float32 can hold."""
-    return isinstance(row, list) and all(
-        isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) <= LARGEST
-        for value in row
-    )
+    return isinstance(row, list) and all(type(one) in (int, float) and abs(one) <= LARGEST for one in row)
 
 
 def read_picture(path: Path) -> UInt8Array:
-    """The picture in a file, ``(height, width, 3)``, turned as a camera's orientation tag says.
-
-    Raises:
-        FileNotFoundError: There is no such file.
-        InputError: It is no picture, is damaged, has more than eight bits a colour, or is too large.
-    """
+    """The picture in a file, ``(height, width, 3)``, turned as a camera's orientation tag says."""
     from PIL import Image, ImageOps
 
     if not path.is_file():
