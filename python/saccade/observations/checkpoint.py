@@ -13,8 +13,7 @@ from saccade.observations.lerobot import IMAGE, IMAGES
 from saccade.observations.requirements import Camera, Requirements
 from saccade.robots import Robot
 from saccade.robots.building import size_of
-from saccade.robots.lerobot_pipeline import read_pipeline
-from saccade.robots.lerobot_steps import PREPROCESSOR
+from saccade.robots.lerobot_pipeline import PREPROCESSOR, read_pipeline
 from saccade.robots.reading import processor_folder, processor_version
 
 #: lerobot's groot policies know this camera by two names.

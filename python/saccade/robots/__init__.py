@@ -10,8 +10,9 @@
 
 from saccade.robots.data_configs import LANGUAGE_KEY, RELEASED, DataConfig, DataConfigLike, data_config
 from saccade.robots.embodiments import N15_IDS, N16_IDS, N17_IDS
-from saccade.robots.groups import Group, Robot
+from saccade.robots.groups import Group
 from saccade.robots.normalizer import Normalizer, padded
+from saccade.robots.robot import Robot
 
 __all__ = [
     "LANGUAGE_KEY",

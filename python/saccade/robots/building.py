@@ -1,4 +1,4 @@
-"""What every layout shares: the options of a request, checked groups, and the finished robot."""
+"""What every layout shares: the options of a request, and checked groups."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from saccade._internal.arrays import integer
 from saccade.errors import CheckpointError, InputError
 from saccade.robots.data_configs import DataConfig, says_nothing
 from saccade.robots.embodiments import resolved
-from saccade.robots.groups import Group, Robot, Statistics
+from saccade.robots.groups import Group, Statistics
 
 #: The statistics that a mode needs. The other modes need none.
 STATISTICS = {
@@ -22,16 +22,10 @@ STATISTICS = {
     "scale": ("min", "max"),
 }
 
-#: The engine's limit of the width of a head.
-MOST_WIDTH = 1 << 20
-
 #: Larger statistics are refused: results could exceed the range of float32, and an action be infinite.
 MOST = 1e30
 #: So are smaller spans, by which values are divided.
 LEAST = 1e-30
-
-#: The widths of state and action that a file says the head has.
-Dims = tuple[int | None, int | None]
 
 
 @dataclass(frozen=True)
@@ -79,14 +73,8 @@ class Builder:
     ) -> Group | None:
         """A group of this mode; None if there is a problem, which is recorded.
 
-        Only the statistics that the mode needs are looked at. The others may be anything.
-
-        Args:
-            key: Its name.
-            statistics: Statistics by name.
-            mode: One of ``STATISTICS``.
-            by_step: Whether there may be a row for each step of a chunk.
-            **switches: The remaining fields of :class:`Group`; ``size`` is that of the statistics by default.
+        Only the statistics that the mode needs are looked at. ``by_step`` is whether there may be a row for
+        each step of a chunk, ``switches`` are the remaining fields of :class:`Group`.
         """
         if not isinstance(statistics, Mapping):
             self.problems.append(f"{key}: no statistics")
@@ -113,14 +101,15 @@ class Builder:
 
     def scaled(self, key: str, mode: str, first: Statistics, second: Statistics, **switches: Any) -> Group:
         """A group with these statistics, after checking that they are in order."""
-        below, above = STATISTICS[mode] if mode != "scale" else ("0", "the largest bound")
-        has_bounds = mode in ("min_max", "q99")
-        if not has_bounds:
-            below = "0"
-        start = first if has_bounds else np.zeros_like(first)
-        if has_bounds:
+        if mode in ("min_max", "q99"):
+            (below, above), start = STATISTICS[mode], first
             moving = ~np.isclose(second, first) if self.is_close else second != first
         else:
+            below, above, start = (
+                "0",
+                "std" if mode == "mean_std" else "the largest bound",
+                np.zeros_like(first),
+            )
             moving = second != 0
         if (second < start).any():
             self.problems.append(f"{key}: {above} is below {below}")
@@ -151,11 +140,7 @@ class Builder:
                 )
 
     def check(self, groups: Iterable[Group | None] = ()) -> tuple[Group, ...]:
-        """The groups.
-
-        Raises:
-            CheckpointError: There were problems. The message lists them.
-        """
+        """The groups, if there were no problems."""
         if self.problems:
             raise CheckpointError(f"{self.where}: " + "; ".join(dict.fromkeys(self.problems)))
         return tuple(group for group in groups if group is not None)
@@ -169,58 +154,6 @@ def width_of(statistics: Any) -> int | None:
         return None
     first = rows[0][0]
     return len(first) if isinstance(first, (list, tuple)) else len(rows[0])
-
-
-def finished(
-    where: str,
-    options: Options,
-    embodiment: str | None,
-    embodiment_id: int | None,
-    state: tuple[Group, ...],
-    action: tuple[Group, ...],
-    dims: Dims,
-    cuts_state: bool = True,
-    hint: str = "",
-    **more: Any,
-) -> Robot:
-    """The robot, after checking that the widths of robot and head fit.
-
-    A head may be wider than the file says: what is beyond is padding, which is zero either way.
-
-    Args:
-        where: The file, for messages.
-        options: What was requested.
-        embodiment, embodiment_id: As in :class:`Robot`.
-        state, action: Groups.
-        dims: The widths that the file says the head has.
-        cuts_state: Whether a state that is too wide is cut off.
-        hint: What to do about a robot that is too wide, for messages.
-        **more: The remaining fields of :class:`Robot`.
-
-    Raises:
-        CheckpointError, InputError: The widths do not fit.
-    """
-    widths = [sum(group.width for group in groups) for groups in (state, action)]
-    found, limits = [], []
-    for name, width, given, said in zip(
-        ("state_dim", "action_dim"), widths, (options.state_dim, options.action_dim), dims, strict=True
-    ):
-        if given is not None and said is not None and given < said:
-            raise InputError(f"{name}: expected at least {said}, the head's in {where}, got {given}")
-        found.append(given or said or width)
-        limits.append(said or given or width)
-        if found[-1] > MOST_WIDTH:
-            raise CheckpointError(f"{where}: {name}: expected at most {MOST_WIDTH}, got {found[-1]}")
-    if widths[0] > limits[0] and not cuts_state:
-        raise CheckpointError(
-            f"{where}: the robot's state has {widths[0]} numbers, the head's only {limits[0]} (state_dim)"
-        )
-    if widths[1] > limits[1]:
-        raise CheckpointError(
-            f"{where}: the robot's action has {widths[1]} numbers, the head's only {limits[1]} (action_dim)"
-            f"{hint}"
-        )
-    return Robot(embodiment, embodiment_id, state, action, found[0], found[1], **more)
 
 
 def size_of(value: Any) -> int | None:

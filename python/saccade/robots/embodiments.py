@@ -34,13 +34,7 @@ MOST_LISTED = 4
 def resolved(text: str, version: str | None, tags: Iterable[str]) -> str:
     """The tag that a text names, as the release resolves it: without case, names before tags.
 
-    Args:
-        text: A tag, or a name of the release.
-        version: ``"n1"`` to ``"n1.7"``; None if it is not known.
-        tags: The tags of a checkpoint. One that no release has is found by its exact text.
-
-    Returns:
-        A tag, which need not be one of ``tags``; or ``text`` unchanged.
+    The tag need not be one of ``tags``, those of a checkpoint, of which one is also found by its exact text.
 
     Example:
         >>> resolved(" XDOF ", "n1.7", ()), resolved("GR1", "n1.6", ()), resolved("my_arm", "n1.6", ())
@@ -65,20 +59,10 @@ def choose(
     where: str,
     needs: Mapping[str, str],
 ) -> str:
-    """The tag of the requested robot.
+    """The tag of the robot that a tag, a name of the release, an id, or None for the only robot, requests.
 
-    Args:
-        wanted: A tag, a name of the release, an id, or None for the only robot. An id may be given for the
-            only robot if that has none: a fine-tune may name a robot that the released code does not know.
-            The id then selects the head's embodiment.
-        tags: The tags that have statistics.
-        ids: Ids by tag.
-        version: As in ``resolved``.
-        where: The file, for messages.
-        needs: What each robot needs, for the message.
-
-    Raises:
-        InputError: It is not there, or there are several and None was given.
+    An id may be given for the only robot if that has none: a fine-tune may name a robot that the released
+    code does not know. The id then selects the head's embodiment. A message lists what each robot ``needs``.
     """
     listed = list(tags)
     if wanted is None:

@@ -1,4 +1,4 @@
-"""Groups of numbers that are normalised alike, and a robot as groups of its state and its action."""
+"""Groups of numbers of a state or an action that are normalised alike."""
 
 from __future__ import annotations
 
@@ -11,8 +11,6 @@ import numpy.typing as npt
 from saccade._internal.arrays import Float32Array
 from saccade.errors import InputError, ShapeError
 from saccade.robots import rotations
-from saccade.robots.data_configs import DataConfig
-from saccade.robots.lerobot_steps import Pipeline
 
 Statistics: TypeAlias = "npt.NDArray[np.floating[Any]]"
 
@@ -27,16 +25,10 @@ class Conversion:
 
 @dataclass(frozen=True)
 class Reference:
-    """What relative actions are relative to.
-
-    Attributes:
-        key: The key of the state.
-        pose: ``"XYZ_ROT6D"`` or ``"XYZ_ROTVEC"`` for poses in the frame of the state's pose; None for numbers
-            that the state is added to.
-    """
+    """What relative actions are relative to: a key of the state."""
 
     key: str
-    pose: str | None = None
+    pose: str | None = None  # a key of ``rotations.POSES``; None for numbers that the state is added to
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,12 +140,7 @@ class Group:
         return found
 
     def absolute(self, reference: Float32Array, values: Float32Array) -> Float32Array:
-        """Relative actions in the robot's units as absolute ones.
-
-        Args:
-            reference: The state, which broadcasts to ``values``.
-            values: ``(..., size)``.
-        """
+        """Relative actions ``(..., size)`` in the robot's units as absolute; the state broadcasts to them."""
         assert self.reference is not None
         if self.reference.pose is None:
             return reference + values
@@ -189,45 +176,3 @@ class Group:
                 f"as many, got {values.shape}"
             )
         return self.first[:steps], self.second[:steps], self.moving[:steps]
-
-
-@dataclass(frozen=True, eq=False)
-class Robot:
-    """A robot as a checkpoint describes it.
-
-    Attributes:
-        embodiment: Tag of the robot, such as ``"new_embodiment"``; None if the statistics have no name.
-        embodiment_id: Its embodiment in the head; None if the checkpoint does not contain it.
-        state_groups: The groups of the state, in the order of its numbers.
-        action_groups: The groups of the action.
-        state_dim: Width of the state that the head takes.
-        action_dim: Width of the action that the head denoises.
-        action_horizon: Number of steps of a chunk that are returned; None for all.
-        trained_horizon: Number of steps of a chunk that were trained; None for all that are returned.
-            lerobot may return more.
-        denoised_horizon: Number of steps that the head must denoise; None for those of its config.
-        state_history: Number of states in an observation; None if the file does not say.
-        zero_state: Whether the head was trained without a state. It then gets zeros.
-        offsets: True for each number of the action that the state's number at the same place is added to:
-            lerobot's ``absolute_actions_processor``. None for none.
-        gripper: The number of the action that becomes ``-sign(2 g - 1)``, as LIBERO's gripper has it in
-            lerobot; or None.
-        data_config: The data config of N1 and N1.5, or None.
-        pipeline: The processors of a policy that lerobot saved, or None.
-    """
-
-    embodiment: str | None
-    embodiment_id: int | None
-    state_groups: tuple[Group, ...]
-    action_groups: tuple[Group, ...]
-    state_dim: int
-    action_dim: int
-    action_horizon: int | None = None
-    trained_horizon: int | None = None
-    denoised_horizon: int | None = None
-    state_history: int | None = None
-    zero_state: bool = False
-    offsets: npt.NDArray[np.bool_] | None = None
-    gripper: int | None = None
-    data_config: DataConfig | None = None
-    pipeline: Pipeline | None = None

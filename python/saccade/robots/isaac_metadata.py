@@ -7,6 +7,7 @@ converted rotation are fixed, and keys that the data config does not use are not
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,10 +15,11 @@ import numpy as np
 
 from saccade._internal.warning import warn
 from saccade.errors import CheckpointError, InputError
-from saccade.robots.building import Builder, Dims, Options, finished
+from saccade.robots.building import Builder, Options
 from saccade.robots.data_configs import RELEASED, DataConfig
 from saccade.robots.embodiments import N15_IDS, choose
-from saccade.robots.groups import Conversion, Group, Robot
+from saccade.robots.groups import Conversion, Group
+from saccade.robots.robot import Dims, Robot, finished
 from saccade.robots.rotations import BOUNDS, SIZES
 
 #: Robots whose published files have keys that no data config uses together.
@@ -30,13 +32,7 @@ KEY_ENTRY = ("absolute", "rotation_type", "shape", "continuous")
 
 @dataclass(frozen=True)
 class Entry:
-    """One robot of ``metadata.json``.
-
-    Attributes:
-        where: The file and the tag, for messages.
-        tag: The robot's tag.
-        statistics, modalities: By ``"state"`` or ``"action"``, and key.
-    """
+    """One robot of ``metadata.json``: statistics and modalities by ``"state"`` or ``"action"``, and key."""
 
     where: str
     tag: str
@@ -47,36 +43,28 @@ class Entry:
         """The keys of the state or the action, in the order of the file."""
         return list(self.modalities.get(kind) or {})
 
-    def is_rotation(self, kind: str, key: str) -> bool:
-        """Whether the file says that a key is a rotation."""
-        about = (self.modalities.get(kind) or {}).get(key)
-        return isinstance(about, Mapping) and about.get("rotation_type") is not None
-
 
 def metadata_robot(values: Mapping[str, Any], options: Options, where: str, dims: Dims) -> Robot:
-    """The robot of a mapping of tags to ``statistics`` and ``modalities``.
-
-    Raises:
-        CheckpointError, InputError: As :meth:`saccade.Normalizer.from_pretrained`.
-    """
+    """The robot of a mapping of tags to ``statistics`` and ``modalities``."""
     needs = {tag: _needs(entry) for tag, entry in values.items()}
-    found = choose(options.embodiment, list(values), N15_IDS, "n1.5", where, needs)
-    entry = _entry(values, found, where)
-    config = options.data_config or _whole_file(entry)
-    state, action = groups_of(entry, config)
+    tag = choose(options.embodiment, list(values), N15_IDS, "n1.5", where, needs)
+    entry = _entry(values, tag, where)
     given = options.data_config
+    state, action = _groups(entry, given or _whole_file(entry))
+    embodiment_id = N15_IDS.get(str(values[tag].get("embodiment_tag", tag)))
+    if given is None:
+        return finished(where, options, tag, embodiment_id, state, action, dims, hint=_fitting_hint(entry))
     return finished(
         where,
         options,
-        entry.tag,
-        N15_IDS.get(str(values[found].get("embodiment_tag", found))),
+        tag,
+        embodiment_id,
         state,
         action,
         dims,
-        hint="" if given is not None else fitting_hint(entry),
-        action_horizon=None if given is None else len(given.action_indices),
-        denoised_horizon=None if given is None else len(given.action_indices),
-        state_history=None if given is None else len(given.observation_indices),
+        action_horizon=len(given.action_indices),
+        denoised_horizon=len(given.action_indices),
+        state_history=len(given.observation_indices),
         data_config=given,
     )
 
@@ -90,46 +78,33 @@ def _needs(entry: Any) -> str:
     return "; ".join(f"{kind} {', '.join(keys)}" for kind, keys in found if isinstance(keys, Mapping))
 
 
-def groups_of(entry: Entry, config: DataConfig) -> tuple[tuple[Group, ...], tuple[Group, ...]]:
-    """The groups of state and action that a data config makes of a robot.
-
-    Raises:
-        CheckpointError: The file does not fit the data config. The message lists every problem.
-    """
+def _groups(entry: Entry, config: DataConfig) -> tuple[tuple[Group, ...], tuple[Group, ...]]:
+    """The groups of state and action that a data config makes of a robot."""
     builder = Builder(entry.where, np.float32)
-    made = {
-        kind: [_group(builder, entry, kind, key, config) for key in config.keys(kind)]
+    states, actions = (
+        [_group(builder, entry, kind, key, config) for key in config.keys(kind)]
         for kind in ("state", "action")
-    }
+    )
     cameras = entry.modalities.get("video") or {}
     lacking = [key for key in config.keys("video") if key not in cameras]
     if lacking:
         builder.problems.append(f"video: no {', '.join(lacking)}; there are {', '.join(cameras) or 'none'}")
-    checked = builder.check([*made["state"], *made["action"]])
-    return checked[: len(made["state"])], checked[len(made["state"]) :]
+    return builder.check(states), builder.check(actions)
 
 
-def fitting_hint(entry: Entry) -> str:
+def _fitting_hint(entry: Entry) -> str:
     """For messages: the released data configs whose keys the file has."""
-    names = fitting(entry)
+    names = []
+    for name, config in RELEASED.items():
+        with suppress(CheckpointError):
+            _groups(entry, config)
+            names.append(name)
     if not names:
         return (
             "; no released data config fits this file: pass data_config= with the JSON of the one it was "
             "trained with"
         )
     return f"; pass data_config= with the one it was trained with. These fit the file: {', '.join(names)}"
-
-
-def fitting(entry: Entry) -> list[str]:
-    """The names of the released data configs that fit a robot."""
-    found = []
-    for name, config in RELEASED.items():
-        try:
-            groups_of(entry, config)
-        except CheckpointError:
-            continue
-        found.append(name)
-    return found
 
 
 def _entry(values: Mapping[str, Any], tag: str, where: str) -> Entry:
@@ -145,15 +120,16 @@ def _entry(values: Mapping[str, Any], tag: str, where: str) -> Entry:
 
 
 def _whole_file(entry: Entry) -> DataConfig:
-    """All keys in the order of the file, for a checkpoint without a data config.
-
-    Raises:
-        InputError: The robot cannot do without one.
-    """
+    """All keys in the order of the file, for a checkpoint without a data config, where that may do."""
     reasons = [f"{entry.tag!r} has more keys than a policy uses"] if entry.tag in NEEDS_DATA_CONFIG else []
     keys = {kind: entry.keys(kind) for kind in ("video", "state", "action")}
+    about = {
+        f"{kind}.{key}": entry.modalities[kind][key] for kind in ("state", "action") for key in keys[kind]
+    }
     turned = [
-        f"{kind}.{key}" for kind in ("state", "action") for key in keys[kind] if entry.is_rotation(kind, key)
+        name
+        for name, one in about.items()
+        if isinstance(one, Mapping) and one.get("rotation_type") is not None
     ]
     if turned:
         are = "is a rotation" if len(turned) == 1 else "are rotations"
@@ -161,25 +137,16 @@ def _whole_file(entry: Entry) -> DataConfig:
     if reasons:
         raise InputError(
             f"data_config: expected one for {entry.where}, got None: {'; '.join(reasons)}"
-            f"{fitting_hint(entry)}"
+            f"{_fitting_hint(entry)}"
         )
     warn(
         f"{entry.where}: no data config is given, so all keys are used, in the order of the file, with their "
         "minimum and maximum (discrete ones: binary). A checkpoint of GR00T N1 or N1.5 does not say which "
         "data config it was trained with: pass data_config= to be certain"
     )
-
-    def modes(kind: str) -> dict[str, str]:
-        about = entry.modalities[kind]
-        return {
-            f"{kind}.{key}": "min_max" if about[key].get("continuous", True) else "binary"
-            for key in keys[kind]
-        }
-
-    names = {kind: tuple(f"{kind}.{key}" for key in found) for kind, found in keys.items()}
-    return DataConfig(
-        names["video"], names["state"], names["action"], (), (0,), (0,), modes("state"), modes("action"), {}
-    )
+    video, state, action = (tuple(f"{kind}.{key}" for key in found) for kind, found in keys.items())
+    modes = {name: "min_max" if one.get("continuous", True) else "binary" for name, one in about.items()}
+    return DataConfig(video, state, action, (), (0,), (0,), modes, modes, {})
 
 
 def _group(builder: Builder, entry: Entry, kind: str, key: str, config: DataConfig) -> Group | None:

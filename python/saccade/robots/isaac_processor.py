@@ -9,10 +9,11 @@ from typing import Any
 import numpy as np
 
 from saccade.errors import CheckpointError
-from saccade.robots.building import Builder, Options, finished, width_of
+from saccade.robots.building import Builder, Options, width_of
 from saccade.robots.embodiments import IDS, choose
-from saccade.robots.groups import Group, Reference, Robot
-from saccade.robots.lerobot_steps import KNOWN, action_steps
+from saccade.robots.groups import Group, Reference
+from saccade.robots.lerobot_pipeline import KNOWN, action_steps
+from saccade.robots.robot import Robot, finished
 from saccade.robots.rotations import POSES
 
 #: Versions by the class of the processor.
@@ -47,20 +48,13 @@ DEFAULT_HORIZON = {"n1.6": 40, "n1.7": 50}
 
 @dataclass(frozen=True)
 class Modality:
-    """What a processor says of the state or of the action of one robot.
-
-    Attributes:
-        keys: Keys in order.
-        steps: Number of states of an observation, or of actions of a chunk.
-        sin_cos, mean_std: Keys that are treated so.
-        references: For actions, what a key is relative to.
-    """
+    """What a processor says of the state or of the action of one robot."""
 
     keys: tuple[str, ...]
-    steps: int
+    steps: int  # states of an observation, or actions of a chunk
     sin_cos: tuple[str, ...]
     mean_std: tuple[str, ...]
-    references: Mapping[str, Reference]
+    references: Mapping[str, Reference]  # for actions, what a key is relative to
 
 
 def processor_robot(
@@ -71,18 +65,9 @@ def processor_robot(
     ids: Mapping[str, Any],
     options: Options,
 ) -> Robot:
-    """The robot of a processor.
+    """The robot of ``processor_kwargs``, ``statistics.json`` and ``embodiment_id.json``.
 
-    Args:
-        where: The file, for messages.
-        version: ``"n1.6"`` or ``"n1.7"``; None if the files do not say.
-        kwargs: The ``processor_kwargs`` of ``processor_config.json``.
-        statistics: The contents of ``statistics.json``: statistics by tag, modality and key.
-        ids: The contents of ``embodiment_id.json``, or nothing. The released table adds tags that it lacks.
-        options: What was requested.
-
-    Raises:
-        CheckpointError, InputError: As :meth:`saccade.Normalizer.from_pretrained`.
+    The released table of the version, if that is known, adds ids of tags that the file lacks.
     """
     options.refuse_data_config(where)
     configs = kwargs.get("modality_configs")
@@ -116,9 +101,9 @@ def processor_robot(
     groups = [_state_group(builder, key, numbers, state, switches) for key in state.keys]
     sizes = {one.key: one.size for one in groups if one is not None}
     actions = [_action_group(builder, key, numbers, action, switches, sizes) for key in action.keys]
-    checked = builder.check([*groups, *actions])
-    dims = [kwargs.get(name, DEFAULT_DIM) for name in ("max_state_dim", "max_action_dim")]
-    for name, dim in zip(("max_state_dim", "max_action_dim"), dims, strict=True):
+    builder.check()
+    dims = {name: kwargs.get(name, DEFAULT_DIM) for name in ("max_state_dim", "max_action_dim")}
+    for name, dim in dims.items():
         if type(dim) is not int or dim < 1:
             raise CheckpointError(f"{where}: {name}: expected a positive integer, got {dim!r:.60}")
     return finished(
@@ -126,9 +111,9 @@ def processor_robot(
         options,
         tag,
         known.get(tag),
-        checked[: len(groups)],
-        checked[len(groups) :],
-        (dims[0], dims[1]),
+        builder.check(groups),
+        builder.check(actions),
+        (dims["max_state_dim"], dims["max_action_dim"]),
         cuts_state=False,
         action_horizon=action.steps,
         state_history=state.steps,
@@ -137,11 +122,7 @@ def processor_robot(
 
 
 def checked_ids(where: str, ids: Any) -> dict[str, int]:
-    """Embodiment ids of a file by tag.
-
-    Raises:
-        CheckpointError: They are no such thing. The message names the tags.
-    """
+    """Embodiment ids of a file by tag."""
     found = ids if isinstance(ids, Mapping) else {"the ids": ids}
     wrong = [
         f"{tag} ({number!r:.40})" for tag, number in found.items() if type(number) is not int or number < 0
@@ -201,14 +182,7 @@ def refuse_unknown_fields(builder: Builder, where: str, about: Any) -> None:
 def modality(builder: Builder, config: Any, kind: str, relative: bool) -> Modality:
     """What ``modality_configs`` contain of the state or the action; problems are recorded.
 
-    Args:
-        builder: Where problems are recorded.
-        config: The modality configs of a robot.
-        kind: ``"state"`` or ``"action"``.
-        relative: Whether ``RELATIVE`` actions are converted at all.
-
-    Raises:
-        CheckpointError: There is nothing to read.
+    ``relative`` is whether ``RELATIVE`` actions are converted at all.
     """
     found = config.get(kind) if isinstance(config, Mapping) else None
     keys = found.get("modality_keys") if isinstance(found, Mapping) else None
@@ -274,14 +248,9 @@ def _references(
 
 
 def check_reference(builder: Builder, group: Group, sizes: Mapping[str, int]) -> None:
-    """Records what is wrong with what a group is relative to.
-
-    Args:
-        builder: Where problems are recorded.
-        group: A group of the action with a reference.
-        sizes: Width of each part of the state.
-    """
-    assert group.reference is not None
+    """Records what is wrong with what a group of the action is relative to, if to anything."""
+    if group.reference is None:
+        return
     pose, key = group.reference.pose, group.reference.key
     if pose is not None and group.size != POSES[pose][0]:
         builder.problems.append(
@@ -297,7 +266,7 @@ def check_reference(builder: Builder, group: Group, sizes: Mapping[str, int]) ->
 def _state_group(
     builder: Builder, key: str, numbers: Any, about: Modality, switches: Mapping[str, bool]
 ) -> Group | None:
-    statistics = _entry(numbers, "state", key)
+    statistics = entry(numbers, "state", key)
     encoded = switches["apply_sincos_state_encoding"] and key in about.sin_cos
     if encoded or switches["exclude_state"]:  # only the width is read
         size = width_of(statistics)
@@ -325,34 +294,22 @@ def _action_group(
     sizes: Mapping[str, int],
 ) -> Group | None:
     """A group of the action, absolute or relative to a group of the state."""
-    reference = about.references.get(key)
-    statistics = _entry(numbers, "action", key)
-    width = width_of(statistics)
+    # The released code reads the width of a relative key from these as well.
+    width = width_of(entry(numbers, "action", key))
     if width is None:
-        # The released code reads the width of a relative key from these as well.
         builder.problems.append(f"{key}: no statistics of the absolute action")
         return None
-    if reference is not None:
-        statistics = _entry(numbers, "relative_action", key)
-    # Actions for training are clipped in every mode.
-    clips = switches["clip_outliers"]
-    if key in about.mean_std:
-        group = builder.group(
-            key,
-            statistics,
-            "mean_std",
-            by_step=True,
-            clips=clips,
-            returns_constant=True,
-            reference=reference,
-        )
-    else:
-        # Relative actions never use quantiles.
-        uses_quantiles = switches["use_percentiles"] and reference is None
-        bounds = _bounds(statistics, uses_quantiles)
-        group = builder.group(
-            key, bounds, "min_max", by_step=True, clips=clips, clips_back=True, reference=reference
-        )
+    reference, by_mean = about.references.get(key), key in about.mean_std
+    group = builder.group(
+        key,
+        action_statistics(numbers, key, reference, switches["use_percentiles"] and not by_mean),
+        "mean_std" if by_mean else "min_max",
+        by_step=True,
+        clips=switches["clip_outliers"],  # actions for training are clipped in every mode
+        clips_back=not by_mean,
+        returns_constant=by_mean,
+        reference=reference,
+    )
     if group is None:
         return None
     if group.size != width:
@@ -363,8 +320,7 @@ def _action_group(
             f"action.{key}: expected statistics of {about.steps} steps, as delta_indices has, got "
             f"{len(group.first)}"
         )
-    if reference is not None:
-        check_reference(builder, group, sizes)
+    check_reference(builder, group, sizes)
     return single_row(group)
 
 
@@ -382,7 +338,15 @@ def _bounds(statistics: Any, uses_quantiles: bool) -> Any:
     return {"min": statistics.get("q01"), "max": statistics.get("q99")}
 
 
-def _entry(numbers: Any, kind: str, key: str) -> Any:
+def action_statistics(numbers: Any, key: str, reference: Reference | None, uses_quantiles: bool) -> Any:
+    """Statistics of a key of the action, absolute or relative. Relative actions never use quantiles."""
+    if reference is not None:
+        return entry(numbers, "relative_action", key)
+    return _bounds(entry(numbers, "action", key), uses_quantiles)
+
+
+def entry(numbers: Any, kind: str, key: str) -> Any:
+    """Statistics of a key, or None."""
     found = numbers.get(kind) if isinstance(numbers, Mapping) else None
     return found.get(key) if isinstance(found, Mapping) else None
 

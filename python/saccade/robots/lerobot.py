@@ -14,19 +14,21 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from saccade.robots.building import Builder, Options, finished, size_of, width_of
+from saccade.robots.building import Builder, Options, size_of, width_of
 from saccade.robots.embodiments import N17_IDS
-from saccade.robots.groups import Group, Robot
+from saccade.robots.groups import Group
 from saccade.robots.isaac_processor import (
     Modality,
+    action_statistics,
     check_reference,
     checked_ids,
+    entry,
     modality,
     refuse_unknown_fields,
     single_row,
 )
-from saccade.robots.lerobot_pipeline import read_pipeline
-from saccade.robots.lerobot_steps import DECODE, Pipeline, action_steps
+from saccade.robots.lerobot_pipeline import DECODE, Pipeline, action_steps, read_pipeline
+from saccade.robots.robot import Robot, finished
 from saccade.robots.rotations import POSES
 
 STATE, ACTION = "observation.state", "action"
@@ -46,11 +48,7 @@ N15_MAPPING = {
 
 
 def lerobot_robot(folder: Path, preprocessor: Mapping[str, Any], options: Options) -> Robot | None:
-    """The robot of a checkpoint's directory; None if ``preprocessor`` has no step of GR00T.
-
-    Raises:
-        FileNotFoundError, CheckpointError, InputError: As :meth:`saccade.Normalizer.from_pretrained`.
-    """
+    """The robot of a checkpoint's directory; None if ``preprocessor`` has no step of GR00T."""
     pipeline = read_pipeline(folder, preprocessor)
     if pipeline is None:
         return None
@@ -106,19 +104,14 @@ def _mapping(pipeline: Pipeline) -> dict[str, int]:
 
 def _state_groups(builder: Builder, pipeline: Pipeline) -> tuple[Group, ...]:
     """The state: one group, or with a raw checkpoint's statistics one for each of its keys."""
-    config = pipeline.pack.config
-    found = pipeline.pack.statistics.get(STATE)
-    scaled = (not pipeline.is_n17 or config.get("normalize_min_max", True)) and found is not None
-    size = pipeline.feature("input_features", STATE)
-    if size is None and found is not None:
-        size = max((np.size(row) for name, row in found.items() if name in ("min", "max")), default=None)
+    config, found = pipeline.pack.config, pipeline.pack.statistics.get(STATE)
+    size = pipeline.feature("input_features", STATE) or _length(found)
     if size is None:
         builder.problems.append("state: of unknown size, since config.json has no observation.state")
         return ()
     parts = _parts(pipeline, size)
-    if not scaled:
+    if found is None or (pipeline.is_n17 and not config.get("normalize_min_max", True)):
         return tuple(Group(key, width, "none") for key, width in parts)
-    assert found is not None
     low, high = (_fitted(builder, STATE, found, name, size, fill) for name, fill in (("min", 0), ("max", 1)))
     clips = bool(pipeline.is_n17 and config.get("clip_outliers", True))
     groups, start = [], 0
@@ -133,25 +126,22 @@ def _parts(pipeline: Pipeline, size: int) -> list[tuple[str, int]]:
     """Keys of the state and their widths, if a raw checkpoint's statistics say so."""
     raw, about = pipeline.pack.config.get("raw_stats"), pipeline.pack.config.get("modality_config")
     keys = about.get("state", {}).get("modality_keys") if isinstance(about, Mapping) else None
-    numbers = raw.get("state") if isinstance(raw, Mapping) else None
-    if not isinstance(keys, list) or not isinstance(numbers, Mapping):
+    if not isinstance(keys, list):
         return [("state", size)]
-    widths = [width_of(numbers.get(key)) for key in keys]
-    if None in widths or sum(width or 0 for width in widths) != size:
+    widths = [width_of(entry(raw, "state", key)) for key in keys]
+    known = [width for width in widths if width is not None]
+    if len(known) < len(widths) or sum(known) != size:
         return [("state", size)]
-    return [(str(key), width or 0) for key, width in zip(keys, widths, strict=True)]
+    return list(zip(map(str, keys), known, strict=True))
 
 
 def _flat_groups(builder: Builder, pipeline: Pipeline) -> tuple[Group, ...]:
     """The action as one group."""
     config, statistics = pipeline.unpack.config, pipeline.unpack.statistics
     found = statistics.get(ACTION)
-    size = pipeline.feature("output_features", ACTION)
-    given = size_of(config.get("env_action_dim"))
-    if given is not None and pipeline.is_n17:
-        size = given if size is None else min(size, given)
-    if size is None and found is not None:
-        size = max((np.size(row) for name, row in found.items() if name in ("min", "max")), default=None)
+    given = size_of(config.get("env_action_dim")) if pipeline.is_n17 else None
+    sizes = [size for size in (pipeline.feature("output_features", ACTION), given) if size is not None]
+    size = min(sizes, default=_length(found))
     if size is None:
         builder.problems.append("action: of unknown size, since config.json has no action")
         return ()
@@ -165,15 +155,19 @@ def _flat_groups(builder: Builder, pipeline: Pipeline) -> tuple[Group, ...]:
     return (builder.scaled("action", "min_max", low, high, clips=pipeline.is_n17, clips_back=clips_back),)
 
 
+def _length(statistics: Mapping[str, Any] | None) -> int | None:
+    """Length of the longer bound."""
+    bounds = [row for name, row in (statistics or {}).items() if name in ("min", "max")]
+    return max(map(np.size, bounds), default=None)
+
+
 def _native_groups(builder: Builder, pipeline: Pipeline, state: tuple[Group, ...]) -> tuple[Group, ...]:
     """The groups of a raw checkpoint's statistics."""
     config = pipeline.unpack.config
     raw, about = config.get("raw_stats"), config.get("modality_config")
     if not isinstance(raw, Mapping) or not isinstance(about, Mapping):
         builder.problems.append(f"{DECODE}: no raw_stats and modality_config")
-        builder.check()
-    assert isinstance(raw, Mapping)
-    assert isinstance(about, Mapping)
+        return builder.check()
     action = modality(
         builder, _strict(builder, about), "action", relative=bool(config.get("use_relative_action"))
     )
@@ -181,9 +175,9 @@ def _native_groups(builder: Builder, pipeline: Pipeline, state: tuple[Group, ...
     uses_quantiles, rows = bool(config.get("use_percentiles")), pipeline.rows[0]
     groups = [_native_group(builder, key, raw, action, uses_quantiles, rows) for key in action.keys]
     for group in groups:
-        if group is not None and group.reference is not None:
+        if group is not None:
             check_reference(builder, group, sizes)
-            if group.reference.pose == "XYZ_ROTVEC":
+            if group.reference is not None and group.reference.pose == "XYZ_ROTVEC":
                 builder.problems.append(f"action.{group.key}: lerobot has no relative poses XYZ_ROTVEC")
     return builder.check(groups)
 
@@ -226,19 +220,13 @@ def _native_group(
     builder: Builder, key: str, raw: Mapping[str, Any], about: Modality, uses_quantiles: bool, rows: int
 ) -> Group | None:
     reference = about.references.get(key)
-    kind = "action" if reference is None else "relative_action"
-    numbers, absolute = raw.get(kind), raw.get("action")
-    found = numbers.get(key) if isinstance(numbers, Mapping) else None
-    width = width_of(absolute.get(key) if isinstance(absolute, Mapping) else None)
-    # Relative actions never use quantiles.
-    low, high = ("q01", "q99") if uses_quantiles and reference is None else ("min", "max")
-    if isinstance(found, Mapping):
-        found = {"min": found.get(low), "max": found.get(high)}
+    found = action_statistics(raw, key, reference, uses_quantiles)
     group = builder.group(
         key, found, "min_max", by_step=True, clips=True, clips_back=True, reference=reference
     )
     if group is None or group.first is None:
         return group
+    width = width_of(entry(raw, "action", key))
     if group.size != width:
         builder.problems.append(f"action.{key}: {width} numbers, but statistics of {group.size}")
     if group.first.ndim == 2 and 1 < len(group.first) < rows:

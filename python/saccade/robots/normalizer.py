@@ -23,8 +23,9 @@ from saccade.errors import InputError, ShapeError
 from saccade.robots.building import Options
 from saccade.robots.data_configs import DataConfigLike
 from saccade.robots.data_configs import data_config as read_data_config
-from saccade.robots.groups import Group, Robot
+from saccade.robots.groups import Group
 from saccade.robots.reading import read
+from saccade.robots.robot import Robot
 
 
 class Normalizer(Robot):
@@ -218,13 +219,9 @@ class Normalizer(Robot):
         normalised = padded(_mapped(values, groups, Group.to_head), self.action_dim)
         return like_features(normalised, is_torch(actions))
 
-    @property
-    def _needs_state(self) -> bool:
-        return self.offsets is not None or any(group.reference is not None for group in self.action_groups)
-
     def _absolute(self, actions: Float32Array, state: ArrayLike | None) -> Float32Array:
         """Actions after the steps that follow the normalisation: references, LIBERO's gripper, offsets."""
-        latest = self._latest(state, actions) if self._needs_state else None
+        latest = self._latest(state, actions)
         if latest is not None:
             actions = self._by_reference(Group.absolute, actions, latest)
         if self.gripper is not None:
@@ -234,7 +231,7 @@ class Normalizer(Robot):
 
     def _relative(self, actions: Float32Array, state: ArrayLike | None) -> Float32Array:
         """The inverse of :meth:`_absolute`. A gripper that is open or closed gives 0 or 1."""
-        latest = self._latest(state, actions) if self._needs_state else None
+        latest = self._latest(state, actions)
         if latest is not None:
             actions = actions - self._offset(latest)
         if self.gripper is not None:
@@ -266,10 +263,12 @@ class Normalizer(Robot):
             return np.zeros(self.action_width, np.float32)
         return np.where(self.offsets, latest[..., : self.action_width], np.float32(0))
 
-    def _latest(self, state: ArrayLike | None, actions: Float32Array) -> Float32Array:
-        """The newest state, with axes of length one for the samples and steps of ``actions``."""
+    def _latest(self, state: ArrayLike | None, actions: Float32Array) -> Float32Array | None:
+        """The newest state, with axes of length one for samples and steps; None if actions do not need it."""
+        relative = [group.key for group in self.action_groups if group.reference is not None]
+        if self.offsets is None and not relative:
+            return None
         if state is None:
-            relative = [group.key for group in self.action_groups if group.reference is not None]
             keys = ", ".join(relative) or "this robot"
             raise InputError(
                 f"state: expected the robot's state, because the actions of {keys} are relative to it, got "
@@ -305,7 +304,9 @@ class Normalizer(Robot):
 
     def _head(self, name: str, given: ArrayLike, groups: tuple[Group, ...]) -> Float32Array:
         """An array of the head without its padding, after checking its width."""
-        values = _finite(name, given)
+        values = float32(name, given)
+        if not np.isfinite(values).all():
+            raise InputError(f"{name}: expected finite numbers, got NaN or infinity")
         width = sum(group.width for group in groups)
         if values.ndim < 1 or values.shape[-1] < width:
             raise ShapeError(
@@ -348,10 +349,3 @@ def padded(values: Float32Array, width: int) -> Float32Array:
 def _slices(groups: tuple[Group, ...]) -> dict[str, slice]:
     ends = np.cumsum([group.size for group in groups]).tolist()
     return {group.key: slice(end - group.size, end) for group, end in zip(groups, ends, strict=True)}
-
-
-def _finite(name: str, given: ArrayLike) -> Float32Array:
-    values = float32(name, given)
-    if not np.isfinite(values).all():
-        raise InputError(f"{name}: expected finite numbers, got NaN or infinity")
-    return values

@@ -15,13 +15,13 @@ from saccade._internal.hub import resolve
 from saccade._internal.hub_files import STATISTICS
 from saccade._internal.small_files import read_json
 from saccade.errors import CheckpointError, InputError
-from saccade.robots.building import Builder, Dims, Options, finished, size_of
+from saccade.robots.building import Builder, Options, size_of
 from saccade.robots.data_configs import data_config
 from saccade.robots.embodiments import N15_IDS
-from saccade.robots.groups import Robot
 from saccade.robots.isaac_metadata import metadata_robot
 from saccade.robots.isaac_processor import CLASSES, processor_robot
 from saccade.robots.lerobot import lerobot_robot
+from saccade.robots.robot import Dims, Robot, finished
 
 #: Where a training leaves the processor's files, if not next to the weights.
 PROCESSOR_FOLDER = "processor"
@@ -36,11 +36,7 @@ MODEL_TYPES = {"Gr00tN1d6": "n1.6", "Gr00tN1d7": "n1.7"}
 def read(
     id_or_path: str | os.PathLike[str] | Mapping[str, Any], revision: str | None, options: Options
 ) -> Robot:
-    """The robot that a checkpoint or a mapping describes; see :meth:`saccade.Normalizer.from_pretrained`.
-
-    Raises:
-        FileNotFoundError, CheckpointError, InputError: As there.
-    """
+    """The robot that a checkpoint or a mapping describes; see :meth:`saccade.Normalizer.from_pretrained`."""
     if not isinstance(id_or_path, Mapping):
         where = str(resolve(id_or_path, revision, files=STATISTICS))
     elif revision is None:
@@ -112,7 +108,10 @@ def _metadata(path: Path, values: Mapping[str, Any], options: Options) -> Robot:
     if options.data_config is None and own.is_file():
         options = replace(options, data_config=data_config(own))
     config = read_json(path / "config.json") if (path / "config.json").is_file() else {}
-    return _from_values(values, options, where, _dims(config))
+    head = config.get("action_head_cfg")
+    sizes = head if isinstance(head, Mapping) else {}
+    dims = size_of(sizes.get("max_state_dim")), size_of(sizes.get("action_dim"))
+    return _from_values(values, options, where, dims)
 
 
 #: Files of a checkpoint that have statistics, in the order in which they are tried. A new layout is one more
@@ -136,11 +135,7 @@ def _from_values(values: Mapping[str, Any], options: Options, where: str, dims: 
 
 
 def _flat(values: Any, options: Options, where: str, dims: Dims) -> Robot:
-    """The robot of ``{"state": {...}, "action": {...}}``. lerobot's names of the two are accepted as well.
-
-    Raises:
-        CheckpointError, InputError: As :meth:`saccade.Normalizer.from_pretrained`.
-    """
+    """The robot of ``{"state": {...}, "action": {...}}``. lerobot's names of the two are accepted as well."""
     options.refuse_data_config(where)
     builder = Builder(where, np.float32)
     groups = []
@@ -156,11 +151,3 @@ def _flat(values: Any, options: Options, where: str, dims: Dims) -> Robot:
     elif asked is not None:
         embodiment_id = integer("embodiment", asked, least=0)
     return finished(where, options, tag, embodiment_id, (state,), (action,), dims)
-
-
-def _dims(config: Mapping[str, Any]) -> Dims:
-    """Widths of state and action of a head, from the config of a checkpoint."""
-    head = config.get("action_head_cfg")
-    if not isinstance(head, Mapping):
-        return None, None
-    return size_of(head.get("max_state_dim")), size_of(head.get("action_dim"))

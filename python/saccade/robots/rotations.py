@@ -37,15 +37,9 @@ SMALL_ANGLE = 1e-6
 
 
 def converted(values: npt.NDArray[Any], source: str, target: str) -> Float64Array:
-    """Rotations in another representation.
+    """Rotations ``(..., SIZES[source])`` in another representation, ``(..., SIZES[target])``.
 
-    Args:
-        values: ``(..., SIZES[source])``.
-        source, target: Keys of ``SIZES``.
-
-    Returns:
-        ``(..., SIZES[target])`` float64. NaN where the numbers are no rotation, such as a quaternion of
-        zeros.
+    NaN where the numbers are no rotation, such as a quaternion of zeros.
 
     Example:
         A quarter turn about z:
@@ -65,11 +59,10 @@ def to_matrix(values: npt.NDArray[Any], source: str) -> Float64Array:
         if source == "quaternion":
             return _of_quaternion(given)
         if source == "axis_angle":
-            half = _half_sine(np.linalg.norm(given, axis=-1, keepdims=True))
-            cosine = np.cos(np.linalg.norm(given, axis=-1, keepdims=True) / 2)
-            return _of_quaternion(np.concatenate([cosine, given * half], axis=-1))
-        axes = _axes(source)
-        turns = [_about(axis, given[..., place]) for place, axis in enumerate(axes)]
+            angle = np.linalg.norm(given, axis=-1, keepdims=True)
+            half = given * _half_sine(angle)
+            return _of_quaternion(np.concatenate([np.cos(angle / 2), half], axis=-1))
+        turns = [_about(axis, given[..., place]) for place, axis in enumerate(_axes(source))]
         product: Float64Array = turns[0] @ turns[1] @ turns[2]
         return product
 
@@ -99,13 +92,7 @@ def from_matrix(matrix: Float64Array, target: str) -> Float64Array:
 
 
 def composed(reference: npt.NDArray[Any], relative: npt.NDArray[Any], form: str) -> Float64Array:
-    """Poses that are given in the frame of a reference pose: R_ref R_rel and R_ref t_rel + t_ref.
-
-    Args:
-        reference: The reference pose, ``(..., size)``.
-        relative: The relative poses, ``(..., size)``.
-        form: A key of ``POSES``, which says the size.
-    """
+    """Poses that are given in the frame of a reference pose: R_ref R_rel and R_ref t_rel + t_ref."""
     turn, place = _pose(reference, form)
     inner, offset = _pose(relative, form)
     return _joined(turn @ inner, (turn @ offset[..., None])[..., 0] + place, form)
@@ -197,7 +184,6 @@ def _about(axis: int, angle: Float64Array) -> Float64Array:
     return matrix
 
 
-def _axes(name: str) -> tuple[int, int, int]:
+def _axes(name: str) -> tuple[int, ...]:
     """The axes of Euler angles, 0 to 2, in order."""
-    first, second, third = ("rpy".index(letter) for letter in name.removeprefix("euler_angles_"))
-    return first, second, third
+    return tuple("rpy".index(letter) for letter in name.removeprefix("euler_angles_"))
