@@ -10,11 +10,7 @@ from saccade.robots.embodiments import resolved
 
 
 def check_fit(head: Head, normalizer: Normalizer) -> None:
-    """Checks that a head and a robot have the same widths and numbers of steps.
-
-    Raises:
-        InputError: They do not. The message says what differs.
-    """
+    """Checks that a head and a robot have the same widths, and numbers of steps that fit."""
     config = head.config
     if normalizer.state_dim != config.state_dim or normalizer.action_width > config.action_dim:
         raise InputError(
@@ -22,45 +18,6 @@ def check_fit(head: Head, normalizer: Normalizer) -> None:
             f"{config.action_dim}, as this head has them, got states of width {normalizer.state_dim} "
             f"and actions of width {normalizer.action_width}"
         )
-    _check_steps(head, normalizer)
-
-
-def check_name(embodiment: str, head: Head, normalizer: Normalizer) -> None:
-    """Checks that a name is that of the normalizer's robot, as the head's release resolves it.
-
-    Raises:
-        InputError: It is another robot's.
-    """
-    own = normalizer.embodiment
-    if resolved(embodiment, head.config.version, () if own is None else (own,)) != own:
-        raise InputError(f"embodiment: expected that of the normalizer, {own!r}, got {embodiment!r}")
-
-
-def embodiment_of(head: Head, normalizer: Normalizer, embodiment: str | int | None) -> int:
-    """The head's embodiment: from the statistics, else as requested, else the only one that is loaded."""
-    chosen = requested_id(normalizer, embodiment)
-    if chosen is None and len(head.embodiment_ids) == 1:
-        chosen = head.embodiment_ids[0]
-    listed = ", ".join(map(str, head.embodiment_ids))
-    if chosen is None:
-        raise InputError(
-            f"embodiment: the files do not say which of the head's embodiments {normalizer.embodiment!r} is: "
-            f"pass its id, one of {listed}"
-        )
-    if chosen not in head.embodiment_ids:
-        raise InputError(
-            f"embodiment: expected the id of one of the head's embodiments ({listed}), got {chosen}"
-        )
-    return chosen
-
-
-def _check_steps(head: Head, normalizer: Normalizer) -> None:
-    """Checks that a head denoises and takes as many steps as the robot needs.
-
-    Raises:
-        InputError: It does not.
-    """
-    config = head.config
     needed, least = normalizer.denoised_horizon, normalizer.action_horizon
     if needed is not None and config.action_horizon != needed:
         raise InputError(
@@ -87,12 +44,33 @@ def _check_steps(head: Head, normalizer: Normalizer) -> None:
         )
 
 
-def requested_id(normalizer: Normalizer, embodiment: str | int | None) -> int | None:
-    """The embodiment's id: from the statistics, else as requested, or None.
+def check_name(embodiment: str, head: Head, normalizer: Normalizer) -> None:
+    """Checks that a name is that of the normalizer's robot, as the head's release resolves it."""
+    own = normalizer.embodiment
+    if resolved(embodiment, head.config.version, () if own is None else (own,)) != own:
+        raise InputError(f"embodiment: expected that of the normalizer, {own!r}, got {embodiment!r}")
 
-    Raises:
-        InputError: The two differ.
-    """
+
+def embodiment_of(head: Head, normalizer: Normalizer, embodiment: str | int | None) -> int:
+    """The head's embodiment: from the statistics, else as requested, else the only one that is loaded."""
+    chosen = requested_id(normalizer, embodiment)
+    if chosen is None and len(head.embodiment_ids) == 1:
+        chosen = head.embodiment_ids[0]
+    listed = ", ".join(map(str, head.embodiment_ids))
+    if chosen is None:
+        raise InputError(
+            f"embodiment: the files do not say which of the head's embodiments {normalizer.embodiment!r} is: "
+            f"pass its id, one of {listed}"
+        )
+    if chosen not in head.embodiment_ids:
+        raise InputError(
+            f"embodiment: expected the id of one of the head's embodiments ({listed}), got {chosen}"
+        )
+    return chosen
+
+
+def requested_id(normalizer: Normalizer, embodiment: str | int | None) -> int | None:
+    """The embodiment's id: from the statistics, else as requested, or None. Refused if the two differ."""
     chosen = normalizer.embodiment_id
     if embodiment is None or isinstance(embodiment, str):
         return chosen

@@ -59,16 +59,7 @@ def encode_inputs(
     head: Head,
     previous: PolicyContext | None = None,
 ) -> PolicyContext:
-    """The context of inputs: :func:`compute_features` followed by :func:`encode_features`.
-
-    Args:
-        inputs: As :func:`saccade.policy.preparing.prepare_inputs` returns them.
-        backbone, head: The parts of the policy.
-        previous: The context of earlier observations, from which unchanged views and prompts are taken.
-
-    Raises:
-        InputError: ``previous`` is no context of this policy.
-    """
+    """The context of inputs; unchanged views and prompts are taken from that of earlier observations."""
     return encode_features(compute_features(inputs, backbone, previous), head)
 
 
@@ -77,7 +68,7 @@ def compute_features(
     backbone: VisionLanguageBackbone,
     previous: PolicyContext | None = None,
 ) -> tuple[BackboneFeatures, ...]:
-    """The backbone's features of each of its inputs. Arguments and errors as in :func:`encode_inputs`."""
+    """The backbone's features of each of its inputs; ``previous`` as in :func:`encode_inputs`."""
     if previous is not None and not isinstance(previous, PolicyContext):
         raise InputError(f"previous: expected what encode returns, got {type(previous).__name__}")
     return tuple(backbone.encode_many(inputs, previous=() if previous is None else previous.features))

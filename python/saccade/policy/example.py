@@ -48,12 +48,7 @@ def example_observation(needs: Requirements, normalizer: Normalizer, seed: int) 
 
 
 def _middle(group: Group, pose: str | None) -> Float32Array:
-    """The middle of the range of a part of the state, ``(size,)``; a rotation is that of nothing.
-
-    Args:
-        group: The part of the state.
-        pose: The format of the pose that it is, where actions are relative to it.
-    """
+    """The middle of the range of a part of the state, ``(size,)``, or of a pose; rotations are of nothing."""
     if group.conversion is not None:
         return from_matrix(np.eye(3), group.conversion.robot).astype(np.float32)
     if pose is not None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -25,18 +25,6 @@ HEAD = ("action_head.", "_groot_model.action_head.")
 BACKBONE = ("backbone.", "_groot_model.backbone.")
 
 
-@dataclass(frozen=True)
-class Parts:
-    """The arguments of :class:`saccade.Policy`."""
-
-    head: ActionHead
-    normalizer: Normalizer
-    embodiment: int | None
-    backbone: Backbone
-    processor: Processor
-    requirements: Requirements
-
-
 def load_parts(
     id_or_path: str | os.PathLike[str],
     *,
@@ -51,8 +39,8 @@ def load_parts(
     data_config: DataConfigLike | None,
     action_horizon: int | None,
     processor_options: Mapping[str, Any] | None,
-) -> Parts:
-    """The parts of a whole checkpoint; see :meth:`saccade.Policy.from_pretrained`.
+) -> dict[str, Any]:
+    """The arguments of :class:`saccade.Policy`, from a whole checkpoint.
 
     What is quick to load comes first, so that a mistake is found before gigabytes are read.
     """
@@ -60,45 +48,59 @@ def load_parts(
     path = resolve(id_or_path, revision)
     check_whole(path)
     config = HeadConfig(**_saccade.Published.open(os.fspath(path), None).config())
-    if isinstance(normalizer, Normalizer):
-        if data_config is not None:
-            raise InputError("data_config: expected None with a Normalizer, which has its own")
-    else:
-        normalizer = Normalizer.from_pretrained(
-            path if normalizer is None else normalizer,
+    statistics = read_normalizer(path if normalizer is None else normalizer, embodiment, data_config, config)
+    horizon = _horizon(statistics, action_horizon)
+    requirements = read_requirements(path, statistics)
+    if cameras is not None:
+        chosen = _chosen(cameras, requirements)
+        requirements = replace(requirements, cameras=chosen, takes_extra_cameras=False)
+    processor = Processor.from_pretrained(
+        path, preprocessing=preprocessing, tokenizer=tokenizer, options=processor_options
+    )
+    embodiment_id = requested_id(statistics, embodiment)
+    # The larger part first: what loading needs for a while then adds to less.
+    backbone = Backbone.from_pretrained(path, precision=precisions["backbone"], num_threads=num_threads)
+    head = ActionHead.from_pretrained(
+        path,
+        embodiment_ids=None if embodiment_id is None else [embodiment_id],
+        action_horizon=horizon,
+        # N1.7 takes as many states as its config says; the policy checks that the robot has as many.
+        num_states=None if config.version == "n1.7" else statistics.state_history,
+        precision=precisions["head"],
+        num_threads=num_threads,
+    )
+    return {
+        "head": head,
+        "normalizer": statistics,
+        "embodiment": embodiment_id,
+        "backbone": backbone,
+        "processor": processor,
+        "requirements": requirements,
+    }
+
+
+def read_normalizer(
+    given: Normalizer | Mapping[str, Any] | str | os.PathLike[str],
+    embodiment: str | int | None,
+    data_config: DataConfigLike | None,
+    config: HeadConfig,
+) -> Normalizer:
+    """A normalizer as it is; from anything else as it is read for a head of this config."""
+    if not isinstance(given, Normalizer):
+        return Normalizer.from_pretrained(
+            given,
             embodiment,
             data_config=data_config,
             state_dim=config.state_dim,
             action_dim=config.encoder_action_dim,
         )
-    horizon = _horizon(normalizer, action_horizon)
-    found = read_requirements(path, normalizer)
-    if cameras is not None:
-        found = replace(found, cameras=_chosen(cameras, found), takes_extra_cameras=False)
-    processor = Processor.from_pretrained(
-        path, preprocessing=preprocessing, tokenizer=tokenizer, options=processor_options
-    )
-    chosen = requested_id(normalizer, embodiment)
-    # The larger part first: what loading needs for a while then adds to less.
-    backbone = Backbone.from_pretrained(path, precision=precisions["backbone"], num_threads=num_threads)
-    head = ActionHead.from_pretrained(
-        path,
-        embodiment_ids=None if chosen is None else [chosen],
-        action_horizon=horizon,
-        # N1.7 takes as many states as its config says; the policy checks that the robot has as many.
-        num_states=None if config.version == "n1.7" else normalizer.state_history,
-        precision=precisions["head"],
-        num_threads=num_threads,
-    )
-    return Parts(head, normalizer, chosen, backbone, processor, found)
+    if data_config is not None:
+        raise InputError("data_config: expected None with a Normalizer, which has its own")
+    return given
 
 
 def _horizon(normalizer: Normalizer, requested: int | None) -> int | None:
-    """Number of actions that the head denoises; None for those of its config.
-
-    Raises:
-        InputError: The data config has another number than was requested.
-    """
+    """Number of actions that the head denoises; None for those of its config."""
     asked = optional_integer("action_horizon", requested)
     said = normalizer.denoised_horizon
     if asked is not None and said is not None and asked != said:
@@ -109,12 +111,7 @@ def _horizon(normalizer: Normalizer, requested: int | None) -> int | None:
 
 
 def check_whole(path: Path) -> None:
-    """Checks that a checkpoint holds a head and a backbone.
-
-    Raises:
-        FileNotFoundError, CheckpointError: It does not exist, is damaged, or lacks one of them. The message
-            says which.
-    """
+    """Checks that a checkpoint holds a head and a backbone."""
     names = _saccade.tensor_names(os.fspath(path))
     has_backbone = any(name.startswith(BACKBONE) for name in names)
     # A head alone may have no prefix.
@@ -134,11 +131,7 @@ def check_whole(path: Path) -> None:
 
 
 def _chosen(names: Sequence[str], found: Requirements) -> tuple[Camera, ...]:
-    """Cameras by name, with the sizes that the checkpoint says.
-
-    Raises:
-        InputError: A name is not one of the checkpoint's, or occurs twice.
-    """
+    """Cameras by name, with the sizes that the checkpoint says."""
     chosen = () if isinstance(names, str) else tuple(names)
     if not chosen or len(set(chosen)) != len(chosen) or not all(isinstance(name, str) for name in chosen):
         raise InputError(f"cameras: expected distinct names, at least one, got {names!r}")

@@ -17,7 +17,7 @@ from saccade.policy.compatibility import check_fit, check_name, embodiment_of
 from saccade.policy.encoding import PolicyContext, encode_inputs
 from saccade.policy.example import example_observation
 from saccade.policy.interfaces import Head, VisionLanguageBackbone
-from saccade.policy.loading import load_parts
+from saccade.policy.loading import load_parts, read_normalizer
 from saccade.policy.preparing import prepare_inputs
 from saccade.policy.reading import Observations, is_observation, read_observations, read_states
 from saccade.policy.sampling import Sampling, sample_actions, sample_state
@@ -84,36 +84,24 @@ class Policy:
         processor: Processor | None = None,
         requirements: Requirements | None = None,
     ) -> None:
-        config = head.config
-        if not isinstance(normalizer, Normalizer):
-            source = head.source if normalizer is None else normalizer
-            if source is None:
-                raise InputError(
-                    "normalizer: expected a Normalizer, got None for a head that was not loaded from a "
-                    "checkpoint"
-                )
-            normalizer = Normalizer.from_pretrained(
-                source,
-                embodiment,
-                data_config=data_config,
-                state_dim=config.state_dim,
-                action_dim=config.encoder_action_dim,
+        source = head.source if normalizer is None else normalizer
+        if source is None:
+            raise InputError(
+                "normalizer: expected a Normalizer, got None for a head that was not loaded from a checkpoint"
             )
-        elif data_config is not None:
-            raise InputError("data_config: expected None with a Normalizer, which has its own")
-        elif isinstance(embodiment, str):
-            check_name(embodiment, head, normalizer)
-        check_fit(head, normalizer)
         self.head = head
-        self.normalizer = normalizer
-        self.embodiment_id = embodiment_of(head, normalizer, embodiment)
+        self.normalizer = read_normalizer(source, embodiment, data_config, head.config)
+        if isinstance(embodiment, str) and self.normalizer is normalizer:
+            check_name(embodiment, head, self.normalizer)
+        check_fit(head, self.normalizer)
+        self.embodiment_id = embodiment_of(head, self.normalizer, embodiment)
         self.backbone = backbone
         self.processor = processor
         self.requirements = replace(
             requirements or Requirements(),
-            embodiment=normalizer.embodiment,
-            state=tuple((group.key, group.size) for group in normalizer.state_groups),
-            state_history=config.num_states,
+            embodiment=self.normalizer.embodiment,
+            state=tuple((group.key, group.size) for group in self.normalizer.state_groups),
+            state_history=head.config.num_states,
         )
 
     @classmethod
@@ -188,7 +176,7 @@ class Policy:
             action_horizon=action_horizon,
             processor_options=processor_options,
         )
-        return cls(**vars(parts))
+        return cls(**parts)
 
     def act(
         self,
@@ -406,11 +394,7 @@ class Policy:
         return self.normalizer.actions(actions, state)
 
     def _require_backbone(self) -> tuple[Processor, VisionLanguageBackbone]:
-        """Processor and backbone of a whole policy.
-
-        Raises:
-            InputError: There are none.
-        """
+        """Processor and backbone of a whole policy."""
         if self.processor is None or self.backbone is None:
             raise InputError(
                 "act and encode: this policy has no backbone, since it was made from an action head: call it "

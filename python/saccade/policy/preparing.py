@@ -10,11 +10,7 @@ from saccade.processor import Processor
 
 
 def prepare_inputs(parsed: Iterable[ParsedObservation], processor: Processor) -> list[BackboneInputs]:
-    """Resized frames and token ids of each row of each observation, a batch of one each.
-
-    Raises:
-        InputError, ShapeError, DtypeError: As a call of the processor.
-    """
+    """Resized frames and token ids of each row of each observation, a batch of one each."""
     found = []
     for observation in parsed:
         for frames, instruction in zip(observation.frames, observation.instructions, strict=True):

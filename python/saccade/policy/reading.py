@@ -53,48 +53,32 @@ def is_observation(value: Any) -> bool:
 
 
 def read_observations(observations: Observations, needs: Requirements) -> Batch[ParsedObservation]:
-    """Parses and checks observations.
-
-    Raises:
-        InputError, ShapeError, DtypeError: One does not fit the robot, or was parsed for another policy.
-    """
-    listed, is_single = _listed(observations)
-    return Batch([_parsed(one, needs, read) for one in listed], is_single)
+    """Parses and checks observations. Those that were parsed before must be of this policy."""
+    return _batch(observations, needs, read)
 
 
 def read_states(observations: Observations, needs: Requirements) -> Batch[ParsedState]:
-    """Parses and checks only the states of observations. Raises as :func:`read_observations`."""
-    listed, is_single = _listed(observations)
-    return Batch([_parsed(one, needs, read_state) for one in listed], is_single)
+    """Parses and checks only the states of observations."""
+    return _batch(observations, needs, read_state)
 
 
-def _parsed(
-    observation: Observation | ParsedObservation,
-    needs: Requirements,
-    reader: Callable[[Observation, Requirements], Kind],
-) -> Kind | ParsedObservation:
-    """An observation that was parsed before as it is; any other as the reader parses it."""
-    if not isinstance(observation, ParsedObservation):
-        return reader(observation, needs)
-    if observation.needs != needs:
-        raise InputError(
-            f"observation: expected what was read for this policy, got what was read for "
-            f"another: {observation.needs}, but {needs}"
-        )
-    return observation
-
-
-def _listed(observations: Observations) -> tuple[list[Any], bool]:
-    """Observations as a list, and whether only one was given.
-
-    Raises:
-        InputError: There is none.
-    """
-    if isinstance(observations, Mapping | ParsedObservation):
-        return [observations], True
-    found = list(observations) if isinstance(observations, (list, tuple)) else []
-    if not found:
+def _batch(
+    observations: Observations, needs: Requirements, reader: Callable[[Observation, Requirements], Kind]
+) -> Batch[Kind | ParsedObservation]:
+    is_single = isinstance(observations, Mapping | ParsedObservation)
+    listed: list[Any] = [observations] if is_single else []
+    if isinstance(observations, (list, tuple)):
+        listed = list(observations)
+    if not listed:
         raise InputError(
             f"observation: expected a mapping, or several of them, got {type(observations).__name__}"
         )
-    return found, False
+    found: list[Kind | ParsedObservation] = []
+    for one in listed:
+        if isinstance(one, ParsedObservation) and one.needs != needs:
+            raise InputError(
+                f"observation: expected what was read for this policy, got what was read for "
+                f"another: {one.needs}, but {needs}"
+            )
+        found.append(one if isinstance(one, ParsedObservation) else reader(one, needs))
+    return Batch(found, is_single)

@@ -42,11 +42,7 @@ def sample_actions(
     normalizer: Normalizer,
     embodiment_id: int,
 ) -> Array:
-    """Normalised actions for parsed observations, as :meth:`saccade.ActionHead.sample` returns them.
-
-    Raises:
-        InputError, ShapeError, DtypeError: As :meth:`saccade.Policy.sample`.
-    """
+    """Normalised actions for parsed observations, as :meth:`saccade.ActionHead.sample` returns them."""
     state = batch.state
     if len(state) != context.batch:
         raise InputError(f"observation: expected {context.batch}, as many as in context, got {len(state)}")
@@ -66,7 +62,7 @@ def sample_state(
     normalizer: Normalizer,
     embodiment_id: int,
 ) -> Array:
-    """Normalised actions for a state in the robot's units. Raises as :func:`sample_actions`."""
+    """Normalised actions for a state in the robot's units."""
     if options.previous_chunk is not None:
         options = _continued(options, state, head, normalizer)
     given = {name: value for name, value in vars(options).items() if value is not None}

@@ -13,16 +13,7 @@ from saccade.robots import Normalizer
 
 
 def restore_units(actions: Array, batch: Batch[ParsedState], normalizer: Normalizer) -> Any:
-    """The actions for parsed observations, each in the format of its observation.
-
-    Args:
-        actions: Normalised, ``(rows, ..., horizon, action_dim)``, as the head returned them.
-        batch: The observations that they are for.
-        normalizer: The normalizer of the robot.
-
-    Returns:
-        As :meth:`saccade.Policy.sample` with an observation.
-    """
+    """Normalised actions ``(rows, ..., horizon, action_dim)``, each in the format of its observation."""
     restored = np.asarray(normalizer.actions(actions, batch.state))
     found, start = [], 0
     for parsed in batch:
