@@ -31,13 +31,8 @@ LARGEST = float(np.finfo(np.float32).max)
 class ObservingPolicy(Protocol):
     """What is needed of a :class:`saccade.Policy`: its robot's requirements and statistics."""
 
-    @property
-    def requirements(self) -> Requirements:
-        """As :attr:`saccade.Policy.requirements`."""
-
-    @property
-    def normalizer(self) -> Normalizer:
-        """The robot's statistics."""
+    requirements: Requirements
+    normalizer: Normalizer
 
     def example_observation(self) -> dict[str, Any]:
         """As :meth:`saccade.Policy.example_observation`."""

@@ -95,6 +95,8 @@ class Builder:
         if first.ndim > 1 and not by_step:
             self.problems.append(f"{key}: expected one row of statistics, got {len(first)}")
             return None
+        if len(first) == 1 and first.ndim > 1:  # one row for every step
+            first, second = first[0], second[0]
         if mode == "scale":
             first, second = np.zeros_like(first), np.maximum(np.abs(first), np.abs(second))
         return self.scaled(key, mode, first, second, **switches)
@@ -131,9 +133,9 @@ class Builder:
             return None
         return row
 
-    def refuse_unknown(self, what: str, values: Mapping[str, Any], known: Collection[str]) -> None:
-        """Records keys that are not known, unless they say nothing: null, empty or false."""
-        for name, value in values.items():
+    def refuse_unknown(self, what: str, values: Any, known: Collection[str]) -> None:
+        """Records keys of a mapping that are not known, unless they say nothing: null, empty or false."""
+        for name, value in values.items() if isinstance(values, Mapping) else ():
             if name not in known and not says_nothing(value):
                 self.problems.append(
                     f"{what}: {name} ({value!r:.60}) is not known, and may change the robot's actions"
@@ -144,6 +146,13 @@ class Builder:
         if self.problems:
             raise CheckpointError(f"{self.where}: " + "; ".join(dict.fromkeys(self.problems)))
         return tuple(group for group in groups if group is not None)
+
+
+def value_at(values: Any, *names: Any) -> Any:
+    """The value under names, one in another; None if there is none, or something else than mappings."""
+    for name in names:
+        values = values.get(name) if isinstance(values, Mapping) else None
+    return values
 
 
 def width_of(statistics: Any) -> int | None:

@@ -15,7 +15,7 @@ import numpy as np
 
 from saccade._internal.warning import warn
 from saccade.errors import CheckpointError, InputError
-from saccade.robots.building import Builder, Options
+from saccade.robots.building import Builder, Options, value_at
 from saccade.robots.data_configs import RELEASED, DataConfig
 from saccade.robots.embodiments import N15_IDS, choose
 from saccade.robots.groups import Conversion, Group
@@ -71,10 +71,7 @@ def metadata_robot(values: Mapping[str, Any], options: Options, where: str, dims
 
 def _needs(entry: Any) -> str:
     """Keys that the file has of a robot, for a message."""
-    modalities = entry.get("modalities") if isinstance(entry, Mapping) else None
-    if not isinstance(modalities, Mapping):
-        return ""
-    found = [(kind, modalities.get(kind)) for kind in ("video", "state", "action")]
+    found = [(kind, value_at(entry, "modalities", kind)) for kind in ("video", "state", "action")]
     return "; ".join(f"{kind} {', '.join(keys)}" for kind, keys in found if isinstance(keys, Mapping))
 
 
@@ -126,11 +123,7 @@ def _whole_file(entry: Entry) -> DataConfig:
     about = {
         f"{kind}.{key}": entry.modalities[kind][key] for kind in ("state", "action") for key in keys[kind]
     }
-    turned = [
-        name
-        for name, one in about.items()
-        if isinstance(one, Mapping) and one.get("rotation_type") is not None
-    ]
+    turned = [name for name, one in about.items() if value_at(one, "rotation_type") is not None]
     if turned:
         are = "is a rotation" if len(turned) == 1 else "are rotations"
         reasons.append(f"{', '.join(turned)} {are}, which a data config may convert")

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from saccade.errors import CheckpointError
-from saccade.robots.building import Builder, Options, width_of
+from saccade.robots.building import Builder, Options, value_at, width_of
 from saccade.robots.embodiments import IDS, choose
 from saccade.robots.groups import Group, Reference
 from saccade.robots.lerobot_pipeline import KNOWN, action_steps
@@ -136,13 +136,10 @@ def checked_ids(where: str, ids: Any) -> dict[str, int]:
 
 def _needs(config: Any) -> str:
     """Keys of a robot, for a message."""
-    found = []
-    for kind in ("video", "state", "action"):
-        about = config.get(kind) if isinstance(config, Mapping) else None
-        keys = about.get("modality_keys") if isinstance(about, Mapping) else None
-        if isinstance(keys, list):
-            found.append(f"{kind} {', '.join(map(str, keys))}")
-    return "; ".join(found)
+    found = {kind: value_at(config, kind, "modality_keys") for kind in ("video", "state", "action")}
+    return "; ".join(
+        f"{kind} {', '.join(map(str, keys))}" for kind, keys in found.items() if isinstance(keys, list)
+    )
 
 
 #: Options that are on or off, with the released defaults.
@@ -164,19 +161,13 @@ def _switch(builder: Builder, kwargs: Mapping[str, Any], name: str, default: boo
 
 def refuse_unknown_fields(builder: Builder, where: str, about: Any) -> None:
     """Records what is not known in the modality configs of a robot: modalities, and fields of each."""
-    modalities = about if isinstance(about, Mapping) else {}
-    builder.refuse_unknown(where, modalities, MODALITIES)
+    builder.refuse_unknown(where, about, MODALITIES)
     for kind in MODALITIES[:-1]:
-        config = modalities.get(kind)
-        if not isinstance(config, Mapping):
-            continue
-        builder.refuse_unknown(f"{where}: {kind}", config, MODALITY)
-        keys, actions = (config.get(name) for name in ("modality_keys", "action_configs"))
+        builder.refuse_unknown(f"{where}: {kind}", value_at(about, kind), MODALITY)
+        keys, actions = (value_at(about, kind, name) for name in ("modality_keys", "action_configs"))
         if isinstance(keys, list) and isinstance(actions, list):
             for key, one in zip(keys, actions, strict=False):
-                builder.refuse_unknown(
-                    f"{where}: {kind}.{key}", one if isinstance(one, Mapping) else {}, ACTION
-                )
+                builder.refuse_unknown(f"{where}: {kind}.{key}", one, ACTION)
 
 
 def modality(builder: Builder, config: Any, kind: str, relative: bool) -> Modality:
@@ -184,11 +175,10 @@ def modality(builder: Builder, config: Any, kind: str, relative: bool) -> Modali
 
     ``relative`` is whether ``RELATIVE`` actions are converted at all.
     """
-    found = config.get(kind) if isinstance(config, Mapping) else None
-    keys = found.get("modality_keys") if isinstance(found, Mapping) else None
+    found = value_at(config, kind)
+    keys = value_at(found, "modality_keys")
     if not isinstance(keys, list) or not keys or not all(isinstance(key, str) for key in keys):
         raise CheckpointError(f"{builder.where}: {kind}: no modality_keys")
-    assert isinstance(found, Mapping)
     if len(set(keys)) != len(keys):
         builder.problems.append(f"{kind}: expected distinct modality_keys, got {', '.join(keys)}")
     steps = found.get("delta_indices")
@@ -266,7 +256,7 @@ def check_reference(builder: Builder, group: Group, sizes: Mapping[str, int]) ->
 def _state_group(
     builder: Builder, key: str, numbers: Any, about: Modality, switches: Mapping[str, bool]
 ) -> Group | None:
-    statistics = entry(numbers, "state", key)
+    statistics = value_at(numbers, "state", key)
     encoded = switches["apply_sincos_state_encoding"] and key in about.sin_cos
     if encoded or switches["exclude_state"]:  # only the width is read
         size = width_of(statistics)
@@ -295,7 +285,7 @@ def _action_group(
 ) -> Group | None:
     """A group of the action, absolute or relative to a group of the state."""
     # The released code reads the width of a relative key from these as well.
-    width = width_of(entry(numbers, "action", key))
+    width = width_of(value_at(numbers, "action", key))
     if width is None:
         builder.problems.append(f"{key}: no statistics of the absolute action")
         return None
@@ -315,20 +305,13 @@ def _action_group(
     if group.size != width:
         builder.problems.append(f"action.{key}: {width} numbers, but relative statistics of {group.size}")
     assert group.first is not None
-    if group.first.ndim == 2 and len(group.first) not in (1, about.steps):
+    if group.first.ndim == 2 and len(group.first) != about.steps:
         builder.problems.append(
             f"action.{key}: expected statistics of {about.steps} steps, as delta_indices has, got "
             f"{len(group.first)}"
         )
     check_reference(builder, group, sizes)
-    return single_row(group)
-
-
-def single_row(group: Group) -> Group:
-    """A group whose statistics of one step are those of every step."""
-    if group.first is None or group.first.ndim == 1 or len(group.first) > 1:
-        return group
-    return group.indexed(0)
+    return group
 
 
 def _bounds(statistics: Any, uses_quantiles: bool) -> Any:
@@ -341,14 +324,8 @@ def _bounds(statistics: Any, uses_quantiles: bool) -> Any:
 def action_statistics(numbers: Any, key: str, reference: Reference | None, uses_quantiles: bool) -> Any:
     """Statistics of a key of the action, absolute or relative. Relative actions never use quantiles."""
     if reference is not None:
-        return entry(numbers, "relative_action", key)
-    return _bounds(entry(numbers, "action", key), uses_quantiles)
-
-
-def entry(numbers: Any, kind: str, key: str) -> Any:
-    """Statistics of a key, or None."""
-    found = numbers.get(kind) if isinstance(numbers, Mapping) else None
-    return found.get(key) if isinstance(found, Mapping) else None
+        return value_at(numbers, "relative_action", key)
+    return _bounds(value_at(numbers, "action", key), uses_quantiles)
 
 
 def _check_horizons(

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from saccade.robots.building import Builder, Options, size_of, width_of
+from saccade.robots.building import Builder, Options, size_of, value_at, width_of
 from saccade.robots.embodiments import N17_IDS
 from saccade.robots.groups import Group
 from saccade.robots.isaac_processor import (
@@ -22,10 +22,8 @@ from saccade.robots.isaac_processor import (
     action_statistics,
     check_reference,
     checked_ids,
-    entry,
     modality,
     refuse_unknown_fields,
-    single_row,
 )
 from saccade.robots.lerobot_pipeline import DECODE, Pipeline, action_steps, read_pipeline
 from saccade.robots.robot import Robot, finished
@@ -128,7 +126,7 @@ def _parts(pipeline: Pipeline, size: int) -> list[tuple[str, int]]:
     keys = about.get("state", {}).get("modality_keys") if isinstance(about, Mapping) else None
     if not isinstance(keys, list):
         return [("state", size)]
-    widths = [width_of(entry(raw, "state", key)) for key in keys]
+    widths = [width_of(value_at(raw, "state", key)) for key in keys]
     known = [width for width in widths if width is not None]
     if len(known) < len(widths) or sum(known) != size:
         return [("state", size)]
@@ -226,14 +224,14 @@ def _native_group(
     )
     if group is None or group.first is None:
         return group
-    width = width_of(entry(raw, "action", key))
+    width = width_of(value_at(raw, "action", key))
     if group.size != width:
         builder.problems.append(f"action.{key}: {width} numbers, but statistics of {group.size}")
-    if group.first.ndim == 2 and 1 < len(group.first) < rows:
+    if group.first.ndim == 2 and len(group.first) < rows:
         builder.problems.append(
             f"action.{key}: expected statistics of at least {rows} steps, got {len(group.first)}"
         )
-    return single_row(group)
+    return group
 
 
 def _cut(builder: Builder, groups: tuple[Group, ...], width: int) -> tuple[Group, ...]:

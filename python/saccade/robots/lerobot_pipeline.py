@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from saccade._internal.small_files import read_json, read_small_tensors
 from saccade.errors import CheckpointError
-from saccade.robots.building import Builder, size_of
+from saccade.robots.building import Builder, size_of, value_at
 
 PREPROCESSOR, POSTPROCESSOR = "policy_preprocessor.json", "policy_postprocessor.json"
 
@@ -33,14 +33,10 @@ DELTA = "delta_actions_processor"
 #: Isaac-GR00T's processors.
 KNOWN = json.loads(Path(__file__).with_name("known_options.json").read_text(encoding="utf-8"))
 
-#: The steps of the preprocessor and of the postprocessor with their options. Options of images and text are
-#: read by ``saccade.Processor``.
-BEFORE: Mapping[str, list[str]] = KNOWN["lerobot"]["preprocessor"]
-AFTER: Mapping[str, list[str]] = KNOWN["lerobot"]["postprocessor"]
-#: Keys of ``config.json`` of all releases. lerobot refuses others.
-CONFIG = frozenset(KNOWN["lerobot"]["config"])
-#: Keys that saccade reads besides: sizes of a part of the model, and several action decoders, of forks.
-CONFIG_OF_PARTS = frozenset(KNOWN["lerobot"]["config_of_parts"])
+#: Options of images and text are read by ``saccade.Processor``. ``config`` are the keys of ``config.json`` of
+#: all releases, of which lerobot refuses others; ``config_of_parts`` those that saccade reads besides: sizes
+#: of a part of the model, and several action decoders, of forks.
+LEROBOT: Mapping[str, Any] = KNOWN["lerobot"]
 
 #: lerobot replaces these of N1.5 by N1.7's when it loads a policy.
 MIGRATED = {"chunk_size": (50, 40), "n_action_steps": (50, 40)}
@@ -88,9 +84,7 @@ class Pipeline:
 
     def feature(self, kind: str, name: str) -> int | None:
         """Width of one of ``input_features`` or ``output_features``, or None."""
-        features = self.config.get(kind)
-        feature = features.get(name) if isinstance(features, Mapping) else None
-        shape = feature.get("shape") if isinstance(feature, Mapping) else None
+        shape = value_at(self.config, kind, name, "shape")
         return size_of(shape[-1]) if isinstance(shape, list) and shape else None
 
     def offsets(self, width: int) -> npt.NDArray[np.bool_] | None:
@@ -131,27 +125,26 @@ class Pipeline:
         path = Path(base) / "processor_config.json" if isinstance(base, str) and base else None
         try:
             values = read_json(path) if path is not None and path.is_file() else {}
-            robot = values["processor_kwargs"]["modality_configs"][self.pack.config.get("embodiment_tag")]
-            return len(action_steps(robot)) or None
-        except (CheckpointError, KeyError, TypeError, OSError, ValueError):
+            tag = self.pack.config.get("embodiment_tag")
+            return len(action_steps(value_at(values, "processor_kwargs", "modality_configs", tag))) or None
+        except (CheckpointError, TypeError, OSError, ValueError):
             return None
 
 
 def read_pipeline(folder: Path, preprocessor: Mapping[str, Any]) -> Pipeline | None:
     """Reads both pipelines and ``config.json``; None if ``preprocessor`` is not of a groot policy."""
-    where = str(folder / PREPROCESSOR)
-    before = preprocessor.get("steps")
-    names = [step.get("registry_name") for step in before or () if isinstance(step, Mapping)]
+    where, before = str(folder / PREPROCESSOR), preprocessor.get("steps")
+    names = [value_at(step, "registry_name") for step in before or ()]
     if not any(isinstance(name, str) and name.startswith("groot_") for name in names):
         return None
     after = folder / POSTPROCESSOR
     if not after.is_file():
         raise CheckpointError(f"{after}: missing: it turns actions into the robot's units")
     builder = Builder(where, np.float32)
-    steps = _known(builder, folder, preprocessor, BEFORE)
+    steps = _known(builder, folder, preprocessor, LEROBOT["preprocessor"])
     builder.check()
     ends = Builder(str(after), np.float32)
-    steps_after = _known(ends, folder, read_json(after), AFTER)
+    steps_after = _known(ends, folder, read_json(after), LEROBOT["postprocessor"])
     packs = [step for step in steps if step.name in (PACK_N15, PACK_N17)]
     unpacks = [step for step in steps_after if step.name in (UNPACK_N15, UNPACK_N17, DECODE)]
     if len(packs) != 1:
@@ -175,19 +168,14 @@ def read_pipeline(folder: Path, preprocessor: Mapping[str, Any]) -> Pipeline | N
         raise CheckpointError(f"{folder / 'config.json'}: missing: it decides how lerobot's steps act")
     config = read_json(folder / "config.json")
     policy = Builder(str(folder / "config.json"), np.float32)
-    policy.refuse_unknown("the policy", config, CONFIG | CONFIG_OF_PARTS)
+    policy.refuse_unknown("the policy", config, LEROBOT["config"] + LEROBOT["config_of_parts"])
     policy.check()
     merged = {old: new for one in rename for old, new in one.items()}
     return Pipeline(where, config, pack, unpack, merged, offsets)
 
 
 def _check_order(
-    builder: Builder,
-    ends: Builder,
-    steps: list[Step],
-    steps_after: list[Step],
-    pack: Step,
-    unpack: Step,
+    builder: Builder, ends: Builder, steps: list[Step], steps_after: list[Step], pack: Step, unpack: Step
 ) -> None:
     """Records steps that act at another place than where lerobot's own pipelines have them."""
     renames = [step for step in steps if step.name == RENAME]
@@ -197,22 +185,13 @@ def _check_order(
         given = step.config.get("rename_map") or {}
         if not isinstance(given, Mapping) or not all(isinstance(name, str) for name in given.values()):
             builder.problems.append(f"{RENAME}: rename_map: expected names, got {given!r:.100}")
-    if any(
-        steps_after.index(step) < steps_after.index(unpack) for step in steps_after if step.name == ABSOLUTE
-    ):
+    if any(step.name == ABSOLUTE for step in steps_after[: steps_after.index(unpack)]):
         ends.problems.append(f"expected {ABSOLUTE} after {unpack.name}")
-    config = pack.config
-    if config.get("language_key", "task") != "task":
-        builder.problems.append(
-            f"{pack.name}: language_key: expected task, got {config['language_key']!r:.60}"
-        )
-    if config.get("state_horizon", 1) != 1:
-        builder.problems.append(
-            f"{pack.name}: state_horizon: expected 1, got {config['state_horizon']!r:.60}"
-        )
+    for name, only in (("language_key", "task"), ("state_horizon", 1)):
+        if pack.config.get(name, only) != only:
+            builder.problems.append(f"{pack.name}: {name}: expected {only}, got {pack.config[name]!r:.60}")
     for one, where in ((steps, builder), (steps_after, ends)):
-        for step in one:
-            dtype = step.config.get("float_dtype") if step.name == DEVICE else None
+        for dtype in [step.config.get("float_dtype") for step in one if step.name == DEVICE]:
             if dtype not in (None, "float32"):
                 where.problems.append(f"{DEVICE}: float_dtype: expected null, got {dtype!r:.60}")
 
@@ -251,9 +230,8 @@ def _known(
             continue
         name, config = given.get("registry_name"), given.get("config") or {}
         if not isinstance(name, str) or name not in known:
-            shown = name if name is not None else given.get("class")
-            off = isinstance(config, Mapping) and config.get("enabled") is False
-            if not (off and isinstance(name, str)):
+            if not isinstance(name, str) or value_at(config, "enabled") is not False:
+                shown = name if name is not None else given.get("class")
                 builder.problems.append(
                     f"the step {shown!r:.100} is not known, and may change what the policy computes"
                 )
@@ -284,6 +262,5 @@ def _statistics(folder: Path, name: Any) -> Statistics:
 
 def action_steps(modality_config: Any) -> list[Any]:
     """The steps of the actions in a modality config; empty if it does not say."""
-    action = modality_config.get("action") if isinstance(modality_config, Mapping) else None
-    steps = action.get("delta_indices") if isinstance(action, Mapping) else None
+    steps = value_at(modality_config, "action", "delta_indices")
     return steps if isinstance(steps, list) else []

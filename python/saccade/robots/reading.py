@@ -15,7 +15,7 @@ from saccade._internal.hub import resolve
 from saccade._internal.hub_files import STATISTICS
 from saccade._internal.small_files import read_json
 from saccade.errors import CheckpointError, InputError
-from saccade.robots.building import Builder, Options, size_of
+from saccade.robots.building import Builder, Options, size_of, value_at
 from saccade.robots.data_configs import data_config
 from saccade.robots.embodiments import N15_IDS
 from saccade.robots.isaac_metadata import metadata_robot
@@ -108,10 +108,8 @@ def _metadata(path: Path, values: Mapping[str, Any], options: Options) -> Robot:
     if options.data_config is None and own.is_file():
         options = replace(options, data_config=data_config(own))
     config = read_json(path / "config.json") if (path / "config.json").is_file() else {}
-    head = config.get("action_head_cfg")
-    sizes = head if isinstance(head, Mapping) else {}
-    dims = size_of(sizes.get("max_state_dim")), size_of(sizes.get("action_dim"))
-    return _from_values(values, options, where, dims)
+    widths = [size_of(value_at(config, "action_head_cfg", name)) for name in ("max_state_dim", "action_dim")]
+    return _from_values(values, options, where, (widths[0], widths[1]))
 
 
 #: Files of a checkpoint that have statistics, in the order in which they are tried. A new layout is one more
@@ -134,13 +132,13 @@ def _from_values(values: Mapping[str, Any], options: Options, where: str, dims: 
     return _flat(values, options, where, dims)
 
 
-def _flat(values: Any, options: Options, where: str, dims: Dims) -> Robot:
+def _flat(values: Mapping[str, Any], options: Options, where: str, dims: Dims) -> Robot:
     """The robot of ``{"state": {...}, "action": {...}}``. lerobot's names of the two are accepted as well."""
     options.refuse_data_config(where)
     builder = Builder(where, np.float32)
     groups = []
     for kind, other in (("state", "observation.state"), ("action", "action")):
-        found = values.get(kind, values.get(other)) if isinstance(values, Mapping) else None
+        found = values.get(kind, values.get(other))
         has_bounds = isinstance(found, Mapping) and {"min", "max"} <= set(found)
         groups.append(builder.group(kind, found, "min_max" if has_bounds else "mean_std"))
     state, action = builder.check(groups)

@@ -136,6 +136,11 @@ def _of_quaternion(values: Float64Array) -> Float64Array:
         [s * (x * y + z * w), 1 - s * (x * x + z * z), s * (y * z - x * w)],
         [s * (x * z - y * w), s * (y * z + x * w), 1 - s * (x * x + y * y)],
     ]
+    return _stacked(rows)
+
+
+def _stacked(rows: list[list[Float64Array]]) -> Float64Array:
+    """Matrices of their numbers."""
     return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 
@@ -144,21 +149,13 @@ def _to_quaternion(matrix: Float64Array) -> Float64Array:
     r = matrix
     xx, yy, zz = r[..., 0, 0], r[..., 1, 1], r[..., 2, 2]
     # Each is four times the square of one of w, x, y, z.
-    squares = np.stack([1 + xx + yy + zz, 1 + xx - yy - zz, 1 - xx + yy - zz, 1 - xx - yy + zz], axis=-1)
+    squares = [1 + xx + yy + zz, 1 + xx - yy - zz, 1 - xx + yy - zz, 1 - xx - yy + zz]
     a, b, c = r[..., 2, 1] - r[..., 1, 2], r[..., 0, 2] - r[..., 2, 0], r[..., 1, 0] - r[..., 0, 1]
     d, e, f = r[..., 1, 0] + r[..., 0, 1], r[..., 0, 2] + r[..., 2, 0], r[..., 2, 1] + r[..., 1, 2]
     # Row n is 4 q_n times the quaternion.
-    candidates = np.stack(
-        [
-            np.stack([squares[..., 0], a, b, c], axis=-1),
-            np.stack([a, squares[..., 1], d, e], axis=-1),
-            np.stack([b, d, squares[..., 2], f], axis=-1),
-            np.stack([c, e, f, squares[..., 3]], axis=-1),
-        ],
-        axis=-2,
-    )
-    largest = np.argmax(squares, axis=-1)[..., None, None]
-    chosen = np.take_along_axis(candidates, largest, axis=-2)[..., 0, :]
+    rows = [[squares[0], a, b, c], [a, squares[1], d, e], [b, d, squares[2], f], [c, e, f, squares[3]]]
+    largest = np.argmax(np.stack(squares, axis=-1), axis=-1)[..., None, None]
+    chosen = np.take_along_axis(_stacked(rows), largest, axis=-2)[..., 0, :]
     with np.errstate(invalid="ignore"):
         unit = chosen / np.linalg.norm(chosen, axis=-1, keepdims=True)
     positive: Float64Array = np.where(unit[..., :1] < 0, -unit, unit)
