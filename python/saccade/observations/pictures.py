@@ -192,15 +192,10 @@ def by_number(path: Path) -> list[tuple[int, str]]:
 def observation(
     policy: ObservingPolicy, pictures: Mapping[str, Path], instruction: str | None, state: Any
 ) -> dict[str, Any]:
-    """An observation in Isaac-GR00T's nested format, with a batch of one.
+    """An observation as :meth:`saccade.Policy.example_observation` returns it, with what is given in it.
 
-    Args:
-        policy: The policy that is to accept it.
-        pictures: Files by camera. The name may be empty if there is one camera.
-        instruction: The instruction, or None.
-        state: What :func:`read_state` returned, or None.
-
-    What is not given is that of :meth:`saccade.Policy.example_observation`.
+    These are files by camera, whose name may be empty if there is one camera, the instruction, and what
+    :func:`read_state` returned.
     """
     given = policy.example_observation()
     if pictures:

@@ -8,6 +8,6 @@
 4. ``sampling``: sample normalised actions (:class:`saccade.ActionHead`).
 5. ``units``: convert them to the robot's units (:class:`saccade.Normalizer`) and the observation's format.
 
-``loading`` loads the parts from a checkpoint, ``interfaces`` has what a policy requires of head and backbone,
-``compatibility`` checks that head and statistics fit each other, ``example`` makes an observation to try.
+``loading`` loads the parts from a checkpoint and checks that they fit each other, ``interfaces`` has what a
+policy requires of head and backbone, ``example`` makes an observation to try.
 """

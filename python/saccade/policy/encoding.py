@@ -53,22 +53,12 @@ class PolicyContext:
         return f"<saccade.PolicyContext batch={self.batch} num_vl_tokens={self.num_vl_tokens}>"
 
 
-def encode_inputs(
-    inputs: Sequence[BackboneInputs],
-    backbone: VisionLanguageBackbone,
-    head: Head,
-    previous: PolicyContext | None = None,
-) -> PolicyContext:
-    """The context of inputs; unchanged views and prompts are taken from that of earlier observations."""
-    return encode_features(compute_features(inputs, backbone, previous), head)
-
-
 def compute_features(
     inputs: Sequence[BackboneInputs],
     backbone: VisionLanguageBackbone,
     previous: PolicyContext | None = None,
 ) -> tuple[BackboneFeatures, ...]:
-    """The backbone's features of each of its inputs; ``previous`` as in :func:`encode_inputs`."""
+    """The backbone's features of each of its inputs, unchanged views and prompts taken from ``previous``."""
     if previous is not None and not isinstance(previous, PolicyContext):
         raise InputError(f"previous: expected what encode returns, got {type(previous).__name__}")
     return tuple(backbone.encode_many(inputs, previous=() if previous is None else previous.features))

@@ -23,15 +23,10 @@ Kind = TypeVar("Kind", bound=ParsedState)
 
 @dataclass(frozen=True, eq=False)
 class Batch(Generic[Parsed]):
-    """Parsed observations that are computed together.
-
-    Attributes:
-        parsed: The observations, each of which may have several rows.
-        is_single: Whether one observation was given, and not a sequence.
-    """
+    """Parsed observations that are computed together. Each may have several rows."""
 
     parsed: Sequence[Parsed]
-    is_single: bool
+    is_single: bool  # whether one observation was given, and not a sequence
 
     def __iter__(self) -> Iterator[Parsed]:
         return iter(self.parsed)

@@ -1,10 +1,10 @@
 """Robots: the statistics of their states and actions, and the normalizer that uses them.
 
-- ``normalizer``: :class:`saccade.Normalizer`; ``groups`` has the arithmetic, ``rotations`` that of rotations
-  and poses.
+- ``normalizer``: :class:`saccade.Normalizer`, made of a ``robot``; ``groups`` has the arithmetic,
+  ``rotations`` that of rotations and poses.
 - ``reading``: finds the statistics of a checkpoint and chooses their layout: ``isaac_metadata`` (Isaac-GR00T
   N1 and N1.5, with ``data_configs``), ``isaac_processor`` (Isaac-GR00T N1.6 and N1.7), or ``lerobot`` (with
-  ``lerobot_steps`` and ``lerobot_pipeline``). ``building`` has what the layouts share.
+  ``lerobot_pipeline``). ``building`` has what the layouts share.
 - ``embodiments``: the tags and ids of each release.
 """
 

@@ -36,7 +36,6 @@ ACTION = {
     "rep": ("RELATIVE", "DELTA", "ABSOLUTE"),
     "type": ("EEF", "NON_EEF"),
     "format": ("DEFAULT", *POSES),
-    "state_key": None,
 }
 #: ``rl_info`` may be among them; the released policy drops it.
 MODALITIES = ("video", "state", "action", "language", "rl_info")
@@ -167,7 +166,7 @@ def refuse_unknown_fields(builder: Builder, where: str, about: Any) -> None:
         keys, actions = (value_at(about, kind, name) for name in ("modality_keys", "action_configs"))
         if isinstance(keys, list) and isinstance(actions, list):
             for key, one in zip(keys, actions, strict=False):
-                builder.refuse_unknown(f"{where}: {kind}.{key}", one, ACTION)
+                builder.refuse_unknown(f"{where}: {kind}.{key}", one, (*ACTION, "state_key"))
 
 
 def modality(builder: Builder, config: Any, kind: str, relative: bool) -> Modality:
@@ -211,12 +210,13 @@ def _references(
         if not isinstance(config, Mapping):
             builder.problems.append(f"{where}: expected an action config, got {config!r:.60}")
             continue
-        names, wrong = {}, []
-        for name, allowed in ACTION.items():
-            value = config.get(name)
-            names[name] = value.upper() if isinstance(value, str) and allowed is not None else value
-            if allowed is not None and names[name] not in allowed:
-                wrong.append(f"{where}: {name}: expected one of {', '.join(allowed)}, got {value!r:.60}")
+        given = {name: config.get(name) for name in ACTION}
+        names = {name: value.upper() if isinstance(value, str) else value for name, value in given.items()}
+        wrong = [
+            f"{where}: {name}: expected one of {', '.join(allowed)}, got {given[name]!r:.60}"
+            for name, allowed in ACTION.items()
+            if names[name] not in allowed
+        ]
         builder.problems += wrong
         if wrong or names["rep"] != "RELATIVE" or not relative:
             continue

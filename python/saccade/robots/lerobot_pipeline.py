@@ -58,23 +58,14 @@ class Step:
 
 @dataclass(frozen=True)
 class Pipeline:
-    """A policy that lerobot saved.
+    """A policy that lerobot saved."""
 
-    Attributes:
-        where: The preprocessor's file, for messages.
-        config: The contents of ``config.json``.
-        pack: The step that normalises the state.
-        unpack: The step that turns actions into the robot's units.
-        rename_map: Names of observations that the policy knows under another name.
-        offset_names: Names of the action's numbers and names that are left out, where the state is added to
-            the action; None where it is not.
-    """
-
-    where: str
-    config: Mapping[str, Any]
-    pack: Step
-    unpack: Step
+    where: str  # the preprocessor's file, for messages
+    config: Mapping[str, Any]  # the contents of ``config.json``
+    pack: Step  # normalises the state
+    unpack: Step  # turns actions into the robot's units
     rename_map: Mapping[str, str]
+    #: Where the state is added to the action: names of the action's numbers, and names that are left out.
     offset_names: tuple[tuple[str, ...], tuple[str, ...]] | None
 
     @property
