@@ -11,9 +11,9 @@ from saccade._internal import flags as arguments
 from saccade._internal.flags import UsageError
 from saccade._internal.policy_flags import add_policy_options, policy_options
 from saccade.cli import EXIT_INTERRUPTED, EXIT_OK, require
+from saccade.serve.limits import Limits
 
 if TYPE_CHECKING:
-    from saccade.serve import Limits
     from saccade.serve.logs import Log
 
 HELP = "serve a whole checkpoint to robots and simulators over the network"
@@ -35,12 +35,45 @@ examples:
 """
 
 
+#: Flags, their attributes of :class:`saccade.serve.Limits`, below what they are (None: an integer), and help.
+LIMITS = (
+    (
+        "--request-seconds",
+        "request_seconds",
+        86_400,
+        "drop a request that is older before it is computed; Isaac-GR00T's clients wait 15 s",
+    ),
+    (
+        "--max-message-mb",
+        "message_bytes",
+        4000,
+        "size of a request, in millions of bytes; a larger one costs its connection",
+    ),
+    ("--max-array-elements", "array_elements", None, "elements of an array"),
+    ("--max-values", "objects", None, "values in a request"),
+    ("--max-rows", "rows", None, "observations in a request"),
+    ("--max-waiting", "waiting", None, "requests that wait"),
+    (
+        "--max-waiting-mb",
+        "waiting_bytes",
+        1e6,
+        "size of all requests that are not yet answered, in millions of bytes",
+    ),
+    ("--max-clients", "clients", None, "connections; more are closed"),
+    (
+        "--stall-seconds",
+        "stall_seconds",
+        86_400,
+        "close a connection that is silent or unfinished for so long",
+    ),
+    ("--max-sessions", "sessions", None, "sessions; then the least used is forgotten"),
+    ("--session-seconds", "session_seconds", 1e9, "time after which an unused session is forgotten"),
+)
+
+
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declares the command's arguments."""
-    from saccade.serve.limits import Limits
-
     parser.epilog = EPILOG
-    limits = Limits()
     arguments.add_checkpoint_argument(parser)
     add_policy_options(parser)
     arguments.add_num_steps(parser, "Euler steps of requests that do not say it (default: the checkpoint's)")
@@ -102,57 +135,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default=5.0,
         help="time that a request waits for other clients at most; one client alone never waits",
     )
-    arguments.add_number(
-        batching,
-        "--request-seconds",
-        minimum=0.1,
-        below=86_400,
-        default=limits.request_seconds,
-        help="drop a request that is older before it is computed; Isaac-GR00T's clients wait 15 s",
-    )
-    most = parser.add_argument_group("limits")
-    arguments.add_number(
-        most,
-        "--max-message-mb",
-        minimum=0.001,
-        below=4000,
-        default=limits.message_bytes / 1e6,
-        help="size of a request, in millions of bytes; a larger one costs its connection",
-    )
-    arguments.add_integer(
-        most, "--max-array-elements", default=limits.array_elements, help="elements of an array"
-    )
-    arguments.add_integer(most, "--max-values", default=limits.objects, help="values in a request")
-    arguments.add_integer(most, "--max-rows", default=limits.rows, help="observations in a request")
-    arguments.add_integer(most, "--max-waiting", default=limits.waiting, help="requests that wait")
-    arguments.add_number(
-        most,
-        "--max-waiting-mb",
-        minimum=0.001,
-        below=1e6,
-        default=limits.waiting_bytes / 1e6,
-        help="size of all requests that are not yet answered, in millions of bytes",
-    )
-    arguments.add_integer(most, "--max-clients", default=limits.clients, help="connections; more are closed")
-    arguments.add_number(
-        most,
-        "--stall-seconds",
-        minimum=0.1,
-        below=86_400,
-        default=limits.stall_seconds,
-        help="close a connection that is silent or unfinished for so long",
-    )
-    arguments.add_integer(
-        most, "--max-sessions", default=limits.sessions, help="sessions; then the least used is forgotten"
-    )
-    arguments.add_number(
-        most,
-        "--session-seconds",
-        minimum=0.1,
-        below=1e9,
-        default=limits.session_seconds,
-        help="time after which an unused session is forgotten",
-    )
+    limits = parser.add_argument_group("limits")
+    for flag, name, below, text in LIMITS:
+        group = batching if name == "request_seconds" else limits
+        default = getattr(Limits(), name)
+        if below is None:
+            arguments.add_integer(group, flag, default=default, help=text)
+        elif flag.endswith("-mb"):
+            arguments.add_number(group, flag, minimum=0.001, below=below, default=default / 1e6, help=text)
+        else:
+            arguments.add_number(group, flag, minimum=0.1, below=below, default=default, help=text)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -206,18 +198,8 @@ def make_log(form: str) -> Log:
 
 def limits_of(args: argparse.Namespace) -> Limits:
     """The limits that the arguments state."""
-    from saccade.serve import Limits
-
-    return Limits(
-        message_bytes=int(1e6 * args.max_message_mb),
-        array_elements=args.max_array_elements,
-        objects=args.max_values,
-        rows=args.max_rows,
-        waiting=args.max_waiting,
-        waiting_bytes=int(1e6 * args.max_waiting_mb),
-        clients=args.max_clients,
-        sessions=args.max_sessions,
-        session_seconds=args.session_seconds,
-        request_seconds=args.request_seconds,
-        stall_seconds=args.stall_seconds,
-    )
+    values = {}
+    for flag, name, *_ in LIMITS:
+        value = getattr(args, flag.removeprefix("--").replace("-", "_"))
+        values[name] = int(1e6 * value) if flag.endswith("-mb") else value
+    return Limits(**values)

@@ -46,11 +46,10 @@ class Queue:
 
     A batch is taken when as many observations wait as a batch has, when every client that asked within the
     last second is waiting or being computed, or when the oldest request has waited long enough. A client
-    alone never waits.
+    alone never waits. A request with more observations than a batch is a batch of its own.
 
     Args:
-        max_batch: Observations that are computed at a time. A request with more is a batch of its own.
-        max_wait: Seconds that the oldest request waits for others at most.
+        max_batch, max_wait: As in :class:`saccade.serve.Server`, but in seconds.
         prepare: Called with requests that wait for others, by a thread that would wait with them.
         num_workers: Number of threads that take batches. They share out ``max_batch``, so it is at most that.
         clock: Returns seconds.

@@ -109,16 +109,19 @@ class Log(Protocol):
 
 
 class Writer(logging.handlers.QueueListener):
-    """Writes text to a file descriptor in a thread of its own, and does not close it.
+    """Writes text to a file descriptor, which it does not close, in a thread of its own.
 
-    It takes no lock, for which the end of the program would wait.
+    It takes no lock, for which the end of the program would wait. Of warnings it limits the number a second.
     """
+
+    every = 10.0
 
     def __init__(self, descriptor: int) -> None:
         self._lines: queue.Queue[Any] = queue.Queue(MOST_LINES)
         super().__init__(self._lines)
         self._descriptor = descriptor
         self._not_queued = self._not_written = 0
+        self._second = self._warnings = self._left_out = 0
         self.start()
 
     @property
@@ -151,16 +154,6 @@ class Writer(logging.handlers.QueueListener):
             self.stop()
         self._descriptor = -1  # another file may have the number from now on
 
-
-class _Lines(Writer):
-    """Limits the number of warnings a second."""
-
-    every = 10.0
-
-    def __init__(self, descriptor: int) -> None:
-        super().__init__(descriptor)
-        self._second, self._warnings, self._left_out = 0, 0, 0
-
     def event(self, name: str, **fields: Any) -> None:
         """See :class:`Log`. The next warning that is written says how many were not."""
         if name == "warning":
@@ -179,7 +172,7 @@ class _Lines(Writer):
         raise NotImplementedError
 
 
-class JsonLog(_Lines):
+class JsonLog(Writer):
     """JSON lines: an object with ``event`` and ``time`` (seconds since 1970) each.
 
     Events: ``listening``, ``request``, ``statistics``, ``warning``, ``stopping``, ``stopped``.
@@ -197,7 +190,7 @@ class JsonLog(_Lines):
         self.write(dumps({"event": name, "time": round(time.time(), 6), **fields}, default=str) + "\n")
 
 
-class TextLog(_Lines):
+class TextLog(Writer):
     """Lines for people: what happens, errors, and statistics where there are new requests."""
 
     _last = ""  # of the statistics

@@ -68,11 +68,7 @@ def to_msgpack_numpy(array: npt.NDArray[Any]) -> dict[bytes, Any]:
 
 
 def from_msgpack_numpy(fields: Mapping[Any, Any], most_elements: int) -> Any:
-    """The array or number in a map of the package msgpack-numpy, whose keys are text or bytes.
-
-    Raises:
-        InputError, DtypeError, ShapeError: As :func:`from_npy`.
-    """
+    """The same of a map of the package msgpack-numpy, whose keys are text or bytes; it may be a number."""
     names = ("nd", "type", "kind", "shape", "data")
     is_array, name, kind, shape, data = (fields.get(name.encode(), fields.get(name)) for name in names)
     if isinstance(name, bytes):

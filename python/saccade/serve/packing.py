@@ -88,12 +88,15 @@ def unpack(data: Bytes, limits: Limits) -> Message:
             return from_msgpack_numpy(fields, limits.array_elements)
         return fields
 
+    def refuse_extension(code: int, data: bytes) -> Any:
+        raise InputError(f"message: expected no msgpack extension, got type {code}")
+
     try:
         value = msgpack.unpackb(
             data,
             object_hook=object_hook,
             list_hook=list_hook,
-            ext_hook=_refuse_extension,
+            ext_hook=refuse_extension,
             max_array_len=MOST_ITEMS,
             max_map_len=MOST_ITEMS,
             max_ext_len=0,
@@ -105,10 +108,6 @@ def unpack(data: Bytes, limits: Limits) -> Message:
     except (msgpack.UnpackException, ValueError) as error:
         raise InputError(f"message: {str(error) or 'not msgpack'}") from None
     return Message(value, foreign)
-
-
-def _refuse_extension(code: int, data: bytes) -> Any:
-    raise InputError(f"message: expected no msgpack extension, got type {code}")
 
 
 def is_pickle(data: Bytes) -> bool:

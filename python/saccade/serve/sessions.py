@@ -64,13 +64,7 @@ class Session:
 
 
 class Sessions:
-    """The sessions of a server. Any thread may use it.
-
-    Args:
-        most: Number of sessions; beyond it the one that was used least recently is forgotten.
-        most_seconds: Time after which an unused session is forgotten.
-        clock: Returns seconds.
-    """
+    """The sessions of a server, in number and age as :class:`saccade.serve.Limits` says. For any thread."""
 
     def __init__(self, most: int, most_seconds: float, clock: Callable[[], float] = time.monotonic) -> None:
         self._most, self._most_seconds, self._clock = most, most_seconds, clock
