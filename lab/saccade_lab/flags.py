@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterable
+from pathlib import Path
 
 from saccade._internal.arrays import PRECISIONS
 from saccade._internal.flags import (
     Arguments,
     UsageError,
-    add_checkpoint,
     add_config,
     add_features,
     add_integer,
@@ -17,7 +17,6 @@ from saccade._internal.flags import (
     add_pictures,
     add_preprocessing,
     add_seed,
-    check_known,
 )
 from saccade.errors import InputError
 from saccade_lab.sim.tasks import TASKS
@@ -27,6 +26,19 @@ WITH_FRAMES = (
     *("instruction", "state", "precision", "embodiment", "preprocessing", "tokenizer"),
     *("other_frames", "other_instruction"),  # of `saccade study patching`
 )
+
+
+def add_checkpoint(
+    parser: Arguments,
+    help: str = "directory of a policy (default: the bundled policy)",
+) -> None:
+    """Declares the checkpoint of a command that has a default for it."""
+    parser.add_argument("--checkpoint", type=Path, metavar="PATH", help=help)
+
+
+def add_num_vl_tokens(parser: Arguments, default: int | None, help: str) -> None:
+    """Declares T_vl."""
+    add_integer(parser, "--num-vl-tokens", default=default, help=help)
 
 
 def add_tasks(parser: Arguments, help: str = "tasks to run (default: all that the policy knows)") -> None:
@@ -116,3 +128,15 @@ def indices(flag: str, given: Iterable[int] | None, count: int) -> tuple[int, ..
     if found and (found[0] < 0 or found[-1] >= count):
         raise InputError(f"{flag}: given {', '.join(map(str, found))}, expected 0 to {count - 1}")
     return found
+
+
+def check_known(flag: str, given: Iterable[str], known: Iterable[str]) -> None:
+    """Checks names.
+
+    Raises:
+        InputError: One is unknown; lists those that are known.
+    """
+    known = list(known)
+    for name in given:
+        if name not in known:
+            raise InputError(f"{flag}: unknown name {name!r}, expected one of {', '.join(known)}")

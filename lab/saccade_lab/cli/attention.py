@@ -68,7 +68,7 @@ WIDTH = 160  # characters in a line where the output is not a terminal
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declares the arguments."""
     parser.epilog = EPILOG
-    arguments.add_checkpoint(parser, "directory or .safetensors file (default: the bundled policy)")
+    lab_flags.add_checkpoint(parser, "directory or .safetensors file (default: the bundled policy)")
     arguments.add_config(parser)
     arguments.add_seed(
         parser,
@@ -198,7 +198,7 @@ def check(args: argparse.Namespace) -> None:
     if args.heads is not None and "mean" in args.heads and len(args.heads) > 1:
         raise UsageError("--heads: given mean and numbers, expected one or the other")
     if args.task is not None:
-        arguments.check_known("--task", [args.task], lab_flags.known_tasks())
+        lab_flags.check_known("--task", [args.task], lab_flags.known_tasks())
     of_file = ("layout", "grid", "image_token_index")
     lab_flags.check_frames(args, "features", "task", "after", "config", *of_file)
     if args.features is not None and (args.task is not None or args.after):

@@ -25,6 +25,7 @@ from saccade.cli import EXIT_OK, output
 from saccade.errors import SaccadeError
 from saccade.head.head import ActionHead
 from saccade.processor import Processor
+from saccade_lab import flags as lab_flags
 from saccade_lab.extras import LAB
 from saccade_lab.random_checkpoint import head as random_head
 from saccade_lab.timing import Call, Counter, Machine, arithmetic_of, by_turns, profiled, quartiles, works_of
@@ -59,7 +60,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def add_head_arguments(parser: argparse.ArgumentParser) -> None:
     """Declares which heads are timed, at which sizes and how often; see :func:`prepared`."""
-    arguments.add_checkpoint(
+    lab_flags.add_checkpoint(
         parser, "directory, .safetensors file or published id (default: the bundled policy)"
     )
     parser.add_argument(
@@ -74,7 +75,7 @@ def add_head_arguments(parser: argparse.ArgumentParser) -> None:
         help=f"precisions, of {', '.join(PRECISIONS)} (default: all)",
     )
     arguments.add_num_threads(parser)
-    arguments.add_num_vl_tokens(
+    lab_flags.add_num_vl_tokens(
         parser,
         None,
         f"vision-language tokens (default: a prompt's, else {DEFAULT_VL_TOKENS})",
@@ -116,7 +117,7 @@ def prepared(args: argparse.Namespace) -> tuple[dict[str, ActionHead], str, Call
     """
     if args.checkpoint is not None and args.version is not None:
         raise UsageError("--version describes random weights: leave out --checkpoint")
-    arguments.check_known("--precisions", args.precisions, PRECISIONS)
+    lab_flags.check_known("--precisions", args.precisions, PRECISIONS)
     with head_source(args) as (source, name):
         heads = {}
         for precision in args.precisions:

@@ -22,6 +22,7 @@ from saccade._internal.flags import UsageError
 from saccade._internal.hub import resolve
 from saccade.cli import output
 from saccade.head.inputs import HeadInputs
+from saccade_lab import flags as lab_flags
 from saccade_lab.extras import LAB, require
 
 if TYPE_CHECKING:
@@ -87,7 +88,7 @@ class Result:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declares the command's arguments."""
     parser.epilog = EPILOG
-    arguments.add_checkpoint(parser, "directory, .safetensors file or published id (default: a random head)")
+    lab_flags.add_checkpoint(parser, "directory, .safetensors file or published id (default: a random head)")
     parser.add_argument(
         "--version",
         choices=VERSIONS,
@@ -108,7 +109,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         parser, "--embodiment-id", minimum=0, help="embodiment of random inputs (default: random ids)"
     )
     arguments.add_integer(parser, "--batch", default=1, help="rows of random inputs")
-    arguments.add_num_vl_tokens(parser, 296, "vision-language tokens of random inputs")
+    lab_flags.add_num_vl_tokens(parser, 296, "vision-language tokens of random inputs")
     arguments.add_num_steps(parser)
     parser.add_argument(
         "--precision",

@@ -59,7 +59,7 @@ examples:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declares the arguments."""
     parser.epilog = EPILOG
-    arguments.add_checkpoint(parser)
+    lab_flags.add_checkpoint(parser)
     parser.add_argument(
         "--engine",
         choices=("rust", "torch"),
@@ -145,7 +145,7 @@ def run(args: argparse.Namespace) -> int:
     seeds = check_evaluation_seeds(args.seed, args.episodes)
     lab_flags.check_tasks(args.tasks or ())
     if args.instruction_from is not None:
-        arguments.check_known("--instruction-from", [args.instruction_from], lab_flags.known_tasks())
+        lab_flags.check_known("--instruction-from", [args.instruction_from], lab_flags.known_tasks())
     workers = workers_of(args, args.num_threads)
     require("rollout")
     session = prepare(args, seeds, workers)

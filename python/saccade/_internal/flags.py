@@ -14,8 +14,6 @@ from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any, TypeAlias
 
-from saccade.errors import InputError
-
 #: A parser, or a group of its arguments.
 Arguments: TypeAlias = argparse._ActionsContainer
 
@@ -49,13 +47,8 @@ def number_in(
 class StoreList(argparse.Action):
     """Stores the items of a list as a tuple, in the order given, each once.
 
-    Args:
-        item: Converts a word to an item; raises `ValueError` for a word that is not a number.
-        minimum: Smallest value, for items that are numbers.
-
-    Raises:
-        UsageError: When the argument is parsed: the list is empty, or contains something other than numbers
-            of at least `minimum`.
+    `item` converts a word and raises `ValueError` if it is no number; `minimum` is the smallest number. A
+    list that is empty or has other items is a :class:`UsageError` when the argument is parsed.
     """
 
     def __init__(
@@ -146,17 +139,7 @@ def add_list(
     default: Sequence[Any] | None = None,
     help: str,
 ) -> None:
-    """Declares a list, see `StoreList`; `args` then holds a tuple, or `default` where the flag is absent.
-
-    Args:
-        parser: Parser of the command.
-        flag: Its name, in the plural.
-        item: Converts a word to an item, for example `int`.
-        metavar: What an item is called.
-        minimum: Smallest value, for items that are numbers.
-        default: Value of `args` without the flag.
-        help: Help text, which must state the default.
-    """
+    """Declares a list, see `StoreList`; `args` holds a tuple, or `default`, which `help` must state."""
     parser.add_argument(
         flag,
         action=StoreList,
@@ -177,14 +160,6 @@ def add_checkpoint_argument(parser: Arguments) -> None:
         metavar="CHECKPOINT",
         help="directory, .safetensors file or published id (downloaded with the extra hub)",
     )
-
-
-def add_checkpoint(
-    parser: Arguments,
-    help: str = "directory of a policy (default: the bundled policy)",
-) -> None:
-    """Declares the checkpoint of a command that has a default for it."""
-    parser.add_argument("--checkpoint", type=Path, metavar="PATH", help=help)
 
 
 def add_config(parser: Arguments) -> None:
@@ -210,7 +185,10 @@ def add_seed(parser: Arguments, help: str) -> None:
 def add_preprocessing(parser: Arguments) -> None:
     """Declares what a whole checkpoint may not say: the robot, preprocessing and tokenizer."""
     parser.add_argument(
-        "--embodiment", type=embodiment, metavar="TAG", help="tag or id of the robot, if there are several"
+        "--embodiment",
+        type=lambda word: int(word) if word.isdecimal() else word,
+        metavar="TAG",
+        help="tag or id of the robot, if there are several",
     )
     parser.add_argument(
         "--preprocessing",
@@ -222,18 +200,8 @@ def add_preprocessing(parser: Arguments) -> None:
     )
 
 
-def embodiment(word: str) -> str | int:
-    """A tag, or an id if it is a number."""
-    return int(word) if word.isdecimal() else word
-
-
 def add_pictures(parser: Arguments, flag: str) -> None:
-    """Declares a directory of pictures, an instruction and a state, for `read_frames`.
-
-    Args:
-        parser: Parser or group.
-        flag: Flag of the directory.
-    """
+    """Declares a directory of pictures with the given flag, an instruction and a state."""
     parser.add_argument(
         flag,
         type=Path,
@@ -264,11 +232,6 @@ def add_num_steps(parser: Arguments, help: str = "Euler steps (default: those of
     add_integer(parser, "--num-steps", help=help)
 
 
-def add_num_vl_tokens(parser: Arguments, default: int | None, help: str) -> None:
-    """Declares T_vl."""
-    add_integer(parser, "--num-vl-tokens", default=default, help=help)
-
-
 def add_out(parser: Arguments, default: str | None, help: str = "directory of the results") -> None:
     """Declares the directory to write; without a default it must be given."""
     text = help if default is None else f"{help} (default: {default})"
@@ -279,15 +242,3 @@ def add_out(parser: Arguments, default: str | None, help: str = "directory of th
 def add_json(parser: Arguments, help: str = "print JSON instead of text") -> None:
     """Declares whether JSON is printed."""
     parser.add_argument("--json", action="store_true", help=help)
-
-
-def check_known(flag: str, given: Iterable[str], known: Iterable[str]) -> None:
-    """Checks names.
-
-    Raises:
-        InputError: One is unknown; lists those that are known.
-    """
-    known = list(known)
-    for name in given:
-        if name not in known:
-            raise InputError(f"{flag}: unknown name {name!r}, expected one of {', '.join(known)}")

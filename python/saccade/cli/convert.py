@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import argparse
-import dataclasses
 import re
 
 from saccade._internal import flags as arguments
 from saccade._internal.flags import UsageError
-from saccade.cli import EXIT_OK, output
-from saccade.cli.copying import add_copy_arguments, copying, print_files_not_copied
+from saccade.cli.copying import add_copy_arguments, copy, print_report
 
 HELP = "write a checkpoint with other embodiments, dtype or shards, or merge a LoRA adapter"
 
@@ -63,46 +61,38 @@ def run(args: argparse.Namespace) -> int:
     """Writes the copy and reports what it contains."""
     from saccade.checkpoints import convert
 
-    max_shard_bytes = None if args.max_shard_size is None else size(args.max_shard_size)
-    with copying("converting") as progress:
-        report = convert(
-            args.checkpoint,
-            args.out,
-            adapter=args.adapter,
-            config=args.config,
-            embodiment_ids=None if args.embodiment_ids is None else list(args.embodiment_ids),
-            dtype=args.dtype,
-            max_shard_bytes=max_shard_bytes,
-            head_only=args.head_only,
-            force=args.force,
-            progress=progress,
-        )
-    if args.json:
-        output.print_json(dataclasses.asdict(report), default=str)
-        return EXIT_OK
+    report = copy(
+        convert,
+        "converting",
+        args,
+        adapter=args.adapter,
+        embodiment_ids=None if args.embodiment_ids is None else list(args.embodiment_ids),
+        dtype=args.dtype,
+        max_shard_bytes=None if args.max_shard_size is None else size(args.max_shard_size),
+        head_only=args.head_only,
+    )
     files = f"{len(report.files)} file{'s' if len(report.files) > 1 else ''}"
     others = f"{len(report.carried)} other file{'' if len(report.carried) == 1 else 's'}"
-    print(
+    lines = [
         f"{args.out}: {files}, {report.bytes_after / 1e6:.1f} MB (was {report.bytes_before / 1e6:.1f} MB); "
         f"{report.num_converted} tensors converted, {report.num_dropped} left out; {others} copied"
-    )
+    ]
     if args.adapter is not None:
-        print(
+        lines.append(
             f"merged {args.adapter}: added to {report.num_merged} weights, "
             f"replaced {report.num_replaced} tensors"
         )
     if report.embodiment_ids is not None:
         kept = ", ".join(map(str, report.embodiment_ids))
-        print(f"kept embodiments {kept}; {report.zeroed_bytes / 1e6:.1f} MB of the others are zero")
+        lines.append(f"kept embodiments {kept}; {report.zeroed_bytes / 1e6:.1f} MB of the others are zero")
     if report.num_rounded:
-        print(
+        lines.append(
             f"rounded {report.num_rounded} numbers: largest error {report.largest_error:.3g} (in "
             f"{report.largest_error_in}), largest relative error {report.largest_relative_error:.3g}"
         )
     elif args.dtype is not None:
-        print("nothing was rounded: every number kept its value")
-    print_files_not_copied(report)
-    return EXIT_OK
+        lines.append("nothing was rounded: every number kept its value")
+    return print_report(args, report, lines)
 
 
 def size(text: str) -> int:

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import argparse
-import contextlib
-from collections.abc import Callable, Iterator
-from typing import TYPE_CHECKING
+import dataclasses
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from saccade._internal import flags as arguments
-from saccade.cli import output
+from saccade.cli import EXIT_OK, output
 
 if TYPE_CHECKING:
     from saccade.checkpoints import Written
+
+Report = TypeVar("Report", bound="Written")
 
 
 def add_copy_arguments(parser: argparse.ArgumentParser) -> None:
@@ -23,14 +25,18 @@ def add_copy_arguments(parser: argparse.ArgumentParser) -> None:
     arguments.add_json(parser, "print the report as JSON")
 
 
-@contextlib.contextmanager
-def copying(description: str) -> Iterator[Callable[[int, int], None]]:
-    """A progress bar in bytes; yields a function that takes the bytes done and the bytes in all."""
-    with output.progress_bar(description, in_bytes=True, transient=True) as update:
-        yield lambda done, total: update(done, total)
+def copy(write: Callable[..., Report], doing: str, args: argparse.Namespace, **options: Any) -> Report:
+    """Writes the copy with a function of `saccade.checkpoints`, under a progress bar in bytes."""
+    common = {"config": args.config, "force": args.force}
+    with output.progress_bar(doing, in_bytes=True, transient=True) as update:
+        return write(args.checkpoint, args.out, progress=update, **common, **options)
 
 
-def print_files_not_copied(report: Written) -> None:
-    """Names the files next to the source's weights that were not copied, if there are any."""
-    if report.left:
-        print(f"not copied: {', '.join(map(str, report.left))}")
+def print_report(args: argparse.Namespace, report: Written, lines: list[str], **more: object) -> int:
+    """Prints the report: as JSON with `more`, or lines about it and the files that were not copied."""
+    if args.json:
+        output.print_json({**dataclasses.asdict(report), **more}, default=str)
+        return EXIT_OK
+    left = [f"not copied: {', '.join(map(str, report.left))}"] if report.left else []
+    print("\n".join([*lines, *left]))
+    return EXIT_OK

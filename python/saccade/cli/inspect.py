@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 from collections.abc import Mapping, Sequence
+from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -15,7 +16,7 @@ from saccade.cli import EXIT_OK, output, precisions
 from saccade.cli.tables import Section, show
 
 if TYPE_CHECKING:
-    from saccade.checkpoints.findings import Embodiment, Inspection, Resemblance, Spread, TokenStatistics
+    from saccade.checkpoints.findings import Inspection, Resemblance, Spread, TokenStatistics
     from saccade.checkpoints.whole import BackboneFindings, RobotFindings
 
 HELP = "show what a checkpoint contains"
@@ -75,7 +76,7 @@ def run(args: argparse.Namespace) -> int:
             config=args.config,
             reference=args.reference,
             data_config=args.data_config,
-            progress=lambda done, total: update(done, total),
+            progress=update,
         )
     if args.json:
         output.print_json(dataclasses.asdict(report), indent=1)
@@ -233,22 +234,12 @@ def line(text: str | None) -> str:
 
 def embodiments(report: Inspection) -> Section:
     """Which embodiments look trained; consecutive ids without a name and with equal findings share a row."""
-    rows: list[list[str]] = []
-    run: list[Embodiment] = []
-
-    def close() -> None:
-        if not run:
-            return
+    rows = []
+    for _, group in groupby(report.embodiments, key=lambda one: (one.id if one.names else None, one.weights)):
+        run = list(group)
         ids = str(run[0].id) if len(run) == 1 else f"{run[0].id} to {run[-1].id}"
         norms, scores = [one.norm for one in run], [one.robust_z for one in run]
         rows.append([ids, ", ".join(run[0].names), span(norms, ".2f"), span(scores, ".1f"), run[0].weights])
-        run.clear()
-
-    for entry in report.embodiments:
-        if run and (entry.names or run[-1].names or entry.weights != run[-1].weights):
-            close()
-        run.append(entry)
-    close()
     title = (
         "Embodiments: norms of their layers, and the robust z-scores of these; "
         '"trained" if not distributed as initialised'

@@ -128,18 +128,10 @@ class Update(Protocol):
 
 
 class Lines:
-    """Progress where no bar can be shown, as in a log: at most one line a minute, on standard error.
-
-    Args:
-        description: Description of the work.
-        total: Number of items; None if it is not known yet.
-        in_bytes: Whether the items are bytes.
-    """
+    """Progress where no bar can be shown, as in a log: at most one line a minute, on standard error."""
 
     def __init__(self, description: str, total: int | None, *, in_bytes: bool) -> None:
-        self._description = description
-        self._total = total
-        self._in_bytes = in_bytes
+        self._description, self._total, self._in_bytes = description, total, in_bytes
         self._printed = time.monotonic()
 
     def __call__(self, completed: int, total: int | None = None, description: str | None = None) -> None:
@@ -169,27 +161,18 @@ def progress_bar(
         in_bytes: Whether to show megabytes instead of a count.
         transient: Whether to remove the bar at the end.
     """
-    try:
-        from rich.progress import (
-            BarColumn,
-            DownloadColumn,
-            MofNCompleteColumn,
-            Progress,
-            TextColumn,
-            TimeRemainingColumn,
-        )
-    except ModuleNotFoundError:
+    shown = None
+    with contextlib.suppress(ModuleNotFoundError):
+        from rich import progress as rich
+
+        shown = console(stderr=True)
+    if shown is None or not shown.is_terminal:  # a bar would leave a line there for each of its states
         yield Lines(description, total, in_bytes=in_bytes)
         return
-    shown = console(stderr=True)
-    if not shown.is_terminal:  # a bar would leave a line in the output for each of its states
-        yield Lines(description, total, in_bytes=in_bytes)
-        return
-    counted = DownloadColumn() if in_bytes else MofNCompleteColumn()
-    text = TextColumn("{task.description}", markup=False)
-    with Progress(
-        text, BarColumn(), counted, TimeRemainingColumn(), console=shown, transient=transient
-    ) as progress:
+    text = rich.TextColumn("{task.description}", markup=False)
+    counted = rich.DownloadColumn() if in_bytes else rich.MofNCompleteColumn()
+    columns = (text, rich.BarColumn(), counted, rich.TimeRemainingColumn())
+    with rich.Progress(*columns, console=shown, transient=transient) as progress:
         bar = progress.add_task(description, total=total)
 
         def update(completed: int, total: int | None = None, description: str | None = None) -> None:

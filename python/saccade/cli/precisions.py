@@ -42,7 +42,7 @@ def run(args: argparse.Namespace) -> int:
             processor_options=args.processor_options,
             num_threads=args.num_threads,
             seed=args.seed or 0,
-            progress=lambda done, total: update(done, total),
+            progress=update,
         )
     if args.json:
         output.print_json(dataclasses.asdict(found), indent=1)

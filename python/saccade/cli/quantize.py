@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import argparse
-import dataclasses
 
-from saccade.cli import EXIT_OK, output
-from saccade.cli.copying import add_copy_arguments, copying, print_files_not_copied
+from saccade.cli.copying import add_copy_arguments, copy, print_report
 
 HELP = "write a checkpoint with int8 weights"
 
@@ -39,28 +37,16 @@ def run(args: argparse.Namespace) -> int:
     """Writes the copy and reports what it contains."""
     from saccade.checkpoints import quantize
 
-    with copying("quantizing") as progress:
-        report = quantize(
-            args.checkpoint,
-            args.out,
-            config=args.config,
-            head_only=args.head_only,
-            keep_backbone=args.keep_backbone,
-            force=args.force,
-            progress=progress,
-        )
-    if args.json:
-        output.print_json(dataclasses.asdict(report), default=str)
-        return EXIT_OK
-    before, after = (size / 1e6 for size in (report.head_bytes_before, report.head_bytes_after))
-    print(
+    chosen = {"head_only": args.head_only, "keep_backbone": args.keep_backbone}
+    report = copy(quantize, "quantizing", args, **chosen)
+    lines = [
         f"{args.out}: {report.num_quantized} weights in int8, {report.num_copied} tensors copied, "
-        f"{report.num_dropped} left out; the head has {after:.1f} MB (was {before:.1f} MB)"
-    )
+        f"{report.num_dropped} left out; the head has {report.head_bytes_after / 1e6:.1f} MB "
+        f"(was {report.head_bytes_before / 1e6:.1f} MB)"
+    ]
     if report.num_quantized_backbone:
         before, after = (size / 1e6 for size in (report.backbone_bytes_before, report.backbone_bytes_after))
-        print(f"the backbone has {after:.1f} MB (was {before:.1f} MB)")
+        lines.append(f"the backbone has {after:.1f} MB (was {before:.1f} MB)")
     elif report.backbone_copied is not None:
-        print(f"tensors outside the head were copied as they are: {report.backbone_copied}")
-    print_files_not_copied(report)
-    return EXIT_OK
+        lines.append(f"tensors outside the head were copied as they are: {report.backbone_copied}")
+    return print_report(args, report, lines)

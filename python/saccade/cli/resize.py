@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import argparse
-import dataclasses
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from saccade._internal import flags as arguments
-from saccade.cli import EXIT_OK, output
-from saccade.cli.copying import add_copy_arguments, copying, print_files_not_copied
+from saccade.cli.copying import add_copy_arguments, copy, print_report
 
 if TYPE_CHECKING:
     from saccade.checkpoints import ResizeReport
@@ -66,31 +65,16 @@ def run(args: argparse.Namespace) -> int:
 
     if args.features is not None:  # refused before anything is written
         HeadInputs.from_file(Path(args.features), describe(args.checkpoint, args.config).config)
-    with copying("resizing") as progress:
-        report = resize(
-            args.checkpoint,
-            args.out,
-            num_future_tokens=args.num_future_tokens,
-            perturbation=args.perturbation,
-            seed=args.seed,
-            config=args.config,
-            force=args.force,
-            progress=progress,
-        )
+    sizes = {"num_future_tokens": args.num_future_tokens, "perturbation": args.perturbation}
+    report = copy(resize, "resizing", args, seed=args.seed, **sizes)
     changes = action_changes(
         args.checkpoint, args.out, config=args.config, features=args.features, seed=args.seed
     )
-    if args.json:
-        both = {**dataclasses.asdict(report), "actions": dataclasses.asdict(changes)}
-        output.print_json(both, default=str)
-        return EXIT_OK
-    print_report(args, report, changes)
-    print_files_not_copied(report)
-    return EXIT_OK
+    return print_report(args, report, described(args, report, changes), actions=asdict(changes))
 
 
-def print_report(args: argparse.Namespace, report: ResizeReport, changes: ActionChanges) -> None:
-    """Prints what was written, and how far actions move."""
+def described(args: argparse.Namespace, report: ResizeReport, changes: ActionChanges) -> list[str]:
+    """What was written, and how far actions move."""
     if report.num_after < report.num_before:
         merged = sum(len(group) > 1 for group in report.sources)
         how = f"{merged} of them merged from several"
@@ -98,17 +82,18 @@ def print_report(args: argparse.Namespace, report: ResizeReport, changes: Action
         how = f"{report.num_after - report.num_before} of them copies"
     else:
         how = "unchanged"
-    print(f"{args.out}: {report.num_after} future tokens (was {report.num_before}), {how}")
+    lines = [f"{args.out}: {report.num_after} future tokens (was {report.num_before}), {how}"]
     if report.perturbation_rms:
-        print(f"added noise with root mean square {report.perturbation_rms:.3g} to the copies")
+        lines.append(f"added noise with root mean square {report.perturbation_rms:.3g} to the copies")
     if report.is_widened:
-        print("the tokens are float32 now, because their dtype cannot represent the new values")
+        lines.append("the tokens are float32 now, because their dtype cannot represent the new values")
     observations = "random observations" if args.features is None else f"observations of {args.features}"
-    print(
+    lines.append(
         f"change of actions on {changes.observations} {observations}, in float32 (root mean square of "
         f"actions {changes.actions_rms:.3g}; mean change from other noise {changes.of_other_noise.mean:.3g}):"
     )
     for where, change in (("saccade", changes.in_saccade), ("other programs", changes.in_other_programs)):
-        print(f"  in {where:14}  mean {change.mean:.3g}, largest {change.largest:.3g}")
+        lines.append(f"  in {where:14}  mean {change.mean:.3g}, largest {change.largest:.3g}")
     if report.is_exact:
-        print("the difference in saccade is floating-point rounding")
+        lines.append("the difference in saccade is floating-point rounding")
+    return lines

@@ -5,8 +5,9 @@ from __future__ import annotations
 import argparse
 from collections.abc import Collection, Iterable, Iterator
 
-from saccade._internal.flags import add_list, check_known
+from saccade._internal.flags import add_list
 from saccade.errors import InputError
+from saccade_lab.flags import check_known
 from saccade_lab.study.questions.sweeps_results import PLAIN
 from why_32.arms import ARMS, PolicyArm
 from why_32.measured import MEASURED

@@ -11,9 +11,9 @@ import numpy as np
 import pandas as pd
 
 from saccade._internal.arrays import Float32Array
-from saccade._internal.flags import add_list, check_known
+from saccade._internal.flags import add_list
 from saccade.head.intervention import ROW_GROUPS, Intervention
-from saccade_lab.flags import add_frames, add_rollout_arguments
+from saccade_lab.flags import add_frames, add_rollout_arguments, check_known
 from saccade_lab.study.arguments import source_of
 from saccade_lab.study.arms import Arm, ArmStudy
 from saccade_lab.study.changes import change_section
