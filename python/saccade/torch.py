@@ -110,8 +110,7 @@ class CrossAttention(nn.Module):
         self.requires_grad_(False)
         # Detached tensors share memory and the version counter with the caller's.
         self.load_state_dict({name: state_dict[name].detach() for name in NAMES}, assign=True)
-        weights = self._weights()
-        _PACKED.put(weights, self.heads, self.precision, engine, _fingerprint(weights))
+        _packed(self._weights(), self.heads, self.precision, engine)
 
     @classmethod
     def from_attention(cls, attention: nn.Module, *, precision: str = "float32") -> CrossAttention:
@@ -254,16 +253,7 @@ def cross_attention(
 ) -> torch.Tensor:
     """The operator ``saccade::cross_attention``, which :class:`CrossAttention` calls after its checks.
 
-    Args:
-        hidden_states: ``(batch, queries, width)``.
-        encoder_hidden_states: ``(batch, T_vl, context_dim)``.
-        attention_mask: ``(batch, T_vl)``, bool or floating point, which is added to the logits.
-        weights: Weight and bias of ``to_q``, ``to_k``, ``to_v`` and ``to_out.0``.
-        heads: A divisor of the width.
-        precision: ``"float32"``, ``"bfloat16"`` or ``"int8"``.
-
-    Returns:
-        ``(batch, queries, width)`` in the dtype of ``hidden_states``, contiguous.
+    ``weights`` are in the order of `NAMES`, and the mask has the shape ``(batch, T_vl)``.
     """
     expected = _new_output(hidden_states, encoder_hidden_states, attention_mask, weights, heads, precision)
     output = torch.empty(expected.shape, dtype=torch.float32)
@@ -272,7 +262,7 @@ def cross_attention(
     elif encoder_hidden_states.shape[1] == 0:
         output.copy_(weights[-1])  # without keys, attention is zero, and to_out adds its bias
     else:
-        engine = _PACKED.get(weights, heads, precision)
+        engine = _packed(weights, heads, precision)
         is_bool = attention_mask is not None and attention_mask.dtype == torch.bool
         key_mask, key_bias = (attention_mask, None) if is_bool else (None, attention_mask)
         kv = engine.project(encoder_hidden_states)
@@ -283,46 +273,28 @@ def cross_attention(
 cross_attention.register_fake(_new_output)
 
 
-class _Packed:
-    """Packed weights, cached until the memory of one of the weights is freed."""
-
-    def __init__(self) -> None:
-        self._held: dict[tuple[Any, ...], tuple[bytes, PackedAttention]] = {}
-
-    def get(self, weights: Sequence[torch.Tensor], heads: int, precision: str) -> PackedAttention:
-        """The packed weights. They are packed again if they have changed."""
-        key = _place(weights, heads, precision)
-        fingerprint = _fingerprint(weights)
-        held, engine = self._held.get(key, (None, None))
-        if engine is None or held != fingerprint:
-            tensors = {name: weight.detach() for name, weight in zip(NAMES, weights, strict=True)}
-            engine = PackedAttention(tensors, heads, precision=precision)
-            self.put(weights, heads, precision, engine, fingerprint)
-        return engine
-
-    def put(
-        self,
-        weights: Sequence[torch.Tensor],
-        heads: int,
-        precision: str,
-        engine: PackedAttention,
-        fingerprint: bytes,
-    ) -> None:
-        """Caches packed weights under the place and fingerprint of the weights."""
-        key = _place(weights, heads, precision)
-        if key not in self._held:
-            for weight in weights:
-                weakref.finalize(weight.untyped_storage(), self._held.pop, key, None).atexit = False
-        self._held[key] = fingerprint, engine
+#: Fingerprints and packed weights, until the memory of one of the weights is freed.
+_PACKED: dict[tuple[Any, ...], tuple[bytes, PackedAttention]] = {}
 
 
-_PACKED = _Packed()
-
-
-def _place(weights: Sequence[torch.Tensor], heads: int, precision: str) -> tuple[Any, ...]:
-    """A key for the memory of the weights and for how they are used."""
+def _packed(
+    weights: Sequence[torch.Tensor], heads: int, precision: str, made: PackedAttention | None = None
+) -> PackedAttention:
+    """The packed weights: `made`, or those in the cache unless the weights have changed, or packed now."""
     places = ((w.untyped_storage()._cdata, w.storage_offset(), w.shape, w.stride(), w.dtype) for w in weights)
-    return heads, precision, *places
+    key = heads, precision, *places
+    fingerprint = _fingerprint(weights)
+    held, engine = _PACKED.get(key, (None, None))
+    if made is None and engine is not None and held == fingerprint:
+        return engine
+    if made is None:
+        tensors = {name: weight.detach() for name, weight in zip(NAMES, weights, strict=True)}
+        made = PackedAttention(tensors, heads, precision=precision)
+    if engine is None:
+        for weight in weights:
+            weakref.finalize(weight.untyped_storage(), _PACKED.pop, key, None).atexit = False
+    _PACKED[key] = fingerprint, made
+    return made
 
 
 def _fingerprint(weights: Sequence[torch.Tensor]) -> bytes:

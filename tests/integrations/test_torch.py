@@ -362,7 +362,7 @@ def test_dtype_of_the_weights_may_change() -> None:
 
 def test_packed_weights_go_with_the_weights(packings: list[int]) -> None:
     gc.collect()
-    held = saccade.torch._PACKED._held
+    held = saccade.torch._PACKED
     before = len(held)
     ours = CrossAttention({name: tensor.clone() for name, tensor in attention().state_dict().items()}, HEADS)
     states, context = tensors()

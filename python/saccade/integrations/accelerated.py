@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from types import TracebackType
-from typing import Any
+from types import ModuleType, TracebackType
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -17,9 +16,9 @@ from saccade.head.chunking import Chunking
 from saccade.head.config import HeadConfig
 from saccade.head.head import ActionHead
 from saccade.head.options import LoadOptions, precisions_of_parts
-from saccade.integrations import backbones, heads
+from saccade.integrations import backbones, heads, modules
 from saccade.integrations.accelerated_backbone import AcceleratedBackbone
-from saccade.integrations.stand_in import EXACT_TOLERANCE, ROUNDED_TOLERANCE, Features, StandIn
+from saccade.integrations.stand_in import EXACT_TOLERANCE, ROUNDED_TOLERANCE, Features, Kinds, StandIn
 from saccade.integrations.weights import tensors_of
 
 #: Additional tolerance, relative to the noise, for rounding it at the start and after each of four steps. It
@@ -76,8 +75,8 @@ def accelerate(
         CheckpointError: The weights are not those of a GR00T policy. The message lists every problem.
     """
     precisions = precisions_of_parts(precision)
-    module = heads.find(policy)
-    tower = backbones.find(policy) if backbone else None
+    module = modules.find(policy, heads.is_wanted, heads.WANTED)
+    tower = modules.find(policy, backbones.is_wanted, backbones.WANTED) if backbone else None
     if tower is None and not isinstance(precision, str):
         raise InputError(f"precision: expected one name without backbone=True, got {dict(precision)!r}")
     for part, method in ((module, "get_action"), (tower, "forward")):
@@ -89,17 +88,8 @@ def accelerate(
         autocast = bool(getattr(getattr(policy, "config", None), "use_bf16", False))
         whole = AcceleratedBackbone(tower, precisions["backbone"], num_threads, autocast)
     handle = Accelerated(module, precisions["head"], num_threads, embodiment_ids, whole)
-    handle.install()
+    handle._install()
     return handle
-
-
-@dataclass(frozen=True)
-class Kinds:
-    """The dtypes of the original's noise and actions, and the class of its result."""
-
-    noise: torch.dtype
-    actions: torch.dtype
-    result: type[Any]
 
 
 class Accelerated(StandIn[ActionHead]):
@@ -113,8 +103,9 @@ class Accelerated(StandIn[ActionHead]):
     As a context manager it restores the originals at the end.
     """
 
-    method = "get_action"
-    part = "the head"
+    _method = "get_action"
+    _part = "the head"
+    _structure: ClassVar[ModuleType] = heads
 
     def __init__(
         self,
@@ -124,12 +115,10 @@ class Accelerated(StandIn[ActionHead]):
         embodiment_ids: Sequence[int] | None,
         backbone: AcceleratedBackbone | None,
     ) -> None:
-        self._options = LoadOptions(
-            precision=precision, num_threads=num_threads, embodiment_ids=embodiment_ids
-        )
         self._takes_options = heads.takes_options(module)
         self._backbone = backbone
-        super().__init__(module)
+        options = LoadOptions(precision=precision, num_threads=num_threads, embodiment_ids=embodiment_ids)
+        super().__init__(module, options)
 
     @property
     def head(self) -> ActionHead:
@@ -155,12 +144,6 @@ class Accelerated(StandIn[ActionHead]):
             )
         return self._backbone.backbone
 
-    def install(self) -> None:
-        """Puts the replacements in the place of the originals."""
-        if self._backbone is not None:
-            self._backbone.install()
-        super().install()
-
     def refresh(self) -> None:
         """Copies all weights again. Needed only after a change that the comparison misses.
 
@@ -171,23 +154,13 @@ class Accelerated(StandIn[ActionHead]):
         if self._backbone is not None:
             self._backbone.refresh()
 
-    def check_restorable(self) -> None:
-        """Checks that nothing else has replaced a method since.
-
-        Raises:
-            InputError: Something has.
-        """
-        super().check_restorable()
-        if self._backbone is not None:
-            self._backbone.check_restorable()
-
     def restore(self) -> None:
         """Puts the original methods back and frees the weights in saccade. A second call does nothing.
 
         Raises:
             InputError: A method has been replaced by something else in the meantime. Nothing is changed then.
         """
-        self.check_restorable()
+        self._check_restorable()
         if self._backbone is not None:
             self._backbone.restore()
         super().restore()
@@ -235,10 +208,10 @@ class Accelerated(StandIn[ActionHead]):
         with torch.no_grad():
             head = self._current(module)
             kinds = self._kinds_of(module, head, features, state)
-            chunk = self._chunk(action_input, options, kinds.noise)
-            noise = draw(head.config, features.shape[0], kinds.noise, features.device)
+            chunk = self._chunk(action_input, options, kinds.features)
+            noise = draw(head.config, features.shape[0], kinds.features, features.device)
             actions, vl_embs = run(module, head, backbone_output, action_input, noise, chunk)
-            vl_embs = vl_embs.to(features.device, kinds.noise)
+            vl_embs = vl_embs.to(features.device, kinds.features)
             results = {"action_pred": actions.to(features.device, kinds.actions)}
             if head.config.version not in ("n1", "n1.5"):
                 rows = state.reshape(state.shape[0], 1, -1)
@@ -248,19 +221,20 @@ class Accelerated(StandIn[ActionHead]):
             return kinds.result(data=results)
 
     def __repr__(self) -> str:
-        if self.is_restored:
-            return "<saccade.integrations.Accelerated, restored>"
-        also = "" if self._backbone is None else f" and {self._backbone!r}"
-        return f"<saccade.integrations.Accelerated {type(self.module).__name__} {self._options}{also}>"
+        own = super().__repr__()
+        return own if self._backbone is None or self.is_restored else f"{own[:-1]} and {self._backbone!r}>"
 
-    def _check(self, module: nn.Module) -> None:
-        heads.check(module, self)
+    def _install(self) -> None:
+        if self._backbone is not None:
+            self._backbone._install()
+        super()._install()
 
-    def _settings_of(self, module: nn.Module) -> object:
-        return heads.settings_of(module)
+    def _check_restorable(self) -> None:
+        super()._check_restorable()
+        if self._backbone is not None:
+            self._backbone._check_restorable()
 
     def _convert(self, module: nn.Module) -> ActionHead:
-        self._kinds: dict[tuple[Any, ...], Kinds] = {}
         head = ActionHead.from_tensors(tensors_of(module), config=heads.config_of(module), **self._options)
         parameters = list(module.parameters())
         # With parameters of mixed dtypes, the original works under autocast only.
@@ -347,14 +321,9 @@ def run(
 
 def most_active(module: nn.Module, embodiment_ids: Sequence[int]) -> int:
     """The embodiment whose decoders have the largest weights. It is a trained one, if there is any."""
-    decoders = [
-        parameter for name, parameter in module.named_parameters() if name.endswith("decoder.layer2.W")
-    ]
-    sizes = {
-        index: sum(float(torch.linalg.vector_norm(weight[index].float())) for weight in decoders)
-        for index in embodiment_ids
-    }
-    return max(sizes, key=lambda index: sizes[index])
+    decoders = [weight for name, weight in module.named_parameters() if name.endswith("decoder.layer2.W")]
+    norm = torch.linalg.vector_norm
+    return max(embodiment_ids, key=lambda index: sum(float(norm(one[index].float())) for one in decoders))
 
 
 def check_inputs(
@@ -376,16 +345,13 @@ def check_inputs(
 
 
 def agree(module: nn.Module, head: ActionHead, inputs: tuple[Features, Features], rounded: bool) -> Kinds:
-    """Compares the original and saccade on the same inputs, from the same state of torch's generator.
+    """Compares both on the same inputs, from the same state of torch's generator.
 
     Args:
         module: The original.
         head: Its copy in saccade.
         inputs: Backbone output and action input.
         rounded: Whether one of the two rounds to 8 bits.
-
-    Raises:
-        InputError: The actions differ, or the original draws other random numbers.
     """
     backbone_output, action_input = inputs
     device = backbone_output.backbone_features.device
@@ -416,7 +382,7 @@ def agree(module: nn.Module, head: ActionHead, inputs: tuple[Features, Features]
             f"{name} cannot be accelerated: on random inputs its actions differ from those of saccade; "
             f"expected a difference with norm at most {allowed:.1e}, got {error:.1e}"
         )
-    return Kinds(dtype, theirs.dtype, type(result))
+    return Kinds(dtype, type(result), theirs.dtype)
 
 
 def generator_state(device: torch.device) -> Tensor:

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Mapping
+from types import ModuleType
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -13,17 +13,9 @@ from torch import Tensor, nn
 from saccade.backbone.backbone import Backbone
 from saccade.errors import InputError
 from saccade.head.options import LoadOptions
-from saccade.integrations import backbones
-from saccade.integrations.stand_in import EXACT_TOLERANCE, ROUNDED_TOLERANCE, Features, StandIn
+from saccade.integrations import backbones, modules
+from saccade.integrations.stand_in import EXACT_TOLERANCE, ROUNDED_TOLERANCE, Features, Kinds, StandIn
 from saccade.integrations.weights import tensors_of
-
-
-@dataclass(frozen=True)
-class Kinds:
-    """The dtype of the original's features, and the class of its result."""
-
-    features: torch.dtype
-    result: type[Any]
 
 
 class AcceleratedBackbone(StandIn[Backbone]):
@@ -33,22 +25,17 @@ class AcceleratedBackbone(StandIn[Backbone]):
     for.
     """
 
-    method = "forward"
-    part = "the backbone"
+    _method = "forward"
+    _part = "the backbone"
+    _structure: ClassVar[ModuleType] = backbones
 
     def __init__(self, module: nn.Module, precision: str, num_threads: int | None, autocast: bool) -> None:
-        self._options = LoadOptions(precision=precision, num_threads=num_threads)
         self._autocast = autocast  # whether the policy calls it under autocast to bfloat16
-        super().__init__(module)
+        super().__init__(module, LoadOptions(precision=precision, num_threads=num_threads))
 
     @property
     def backbone(self) -> Backbone:
-        """The backbone in saccade, with the current weights.
-
-        Raises:
-            InputError: As :attr:`module`, and as :func:`saccade.integrations.accelerate` if the weights have
-                changed.
-        """
+        """The backbone in saccade, with the current weights."""
         return self._current(self.module)
 
     def __call__(self, vl_input: Any) -> Any:
@@ -70,7 +57,7 @@ class AcceleratedBackbone(StandIn[Backbone]):
         parts = list(module.named_modules())
         if any(part.training for _, part in parts) or wants_gradient(module, vl_input):
             return self._original()(vl_input)
-        if problems := backbones.in_use(parts[1:]):
+        if problems := list(modules.replaced_or_hooked(parts[1:], backbones.NOUN)):
             raise InputError(f"{type(module).__name__}.forward: {'; '.join(problems)}")
         with torch.no_grad():
             backbone = self._current(module)
@@ -79,19 +66,7 @@ class AcceleratedBackbone(StandIn[Backbone]):
             features = run(module, backbone, vl_input).to(device, kinds.features)
             return kinds.result(data=backbones.results_of(module, vl_input, features))
 
-    def __repr__(self) -> str:
-        if self.is_restored:
-            return "<saccade.integrations.AcceleratedBackbone, restored>"
-        return f"<saccade.integrations.AcceleratedBackbone {type(self.module).__name__} {self._options}>"
-
-    def _check(self, module: nn.Module) -> None:
-        backbones.check(module, self)
-
-    def _settings_of(self, module: nn.Module) -> object:
-        return backbones.settings_of(module)
-
     def _convert(self, module: nn.Module) -> Backbone:
-        self._kinds: dict[tuple[Any, ...], Kinds] = {}
         backbone = Backbone.from_tensors(
             tensors_of(module),
             config=backbones.config_of(module),
@@ -102,7 +77,9 @@ class AcceleratedBackbone(StandIn[Backbone]):
         # With parameters of mixed dtypes, the original works under autocast only.
         mixed = len({parameter.dtype for parameter in parameters}) > 1
         device = parameters[0].device
-        with torch.no_grad(), autocast(device) if mixed or self._autocast else contextlib.nullcontext():
+        with torch.no_grad(), contextlib.ExitStack() as stack:
+            if mixed or self._autocast:  # as lerobot's policies call it
+                stack.enter_context(torch.autocast(device.type, torch.bfloat16))
             self._kinds_of(module, backbone, device)
         return backbone
 
@@ -121,13 +98,6 @@ class AcceleratedBackbone(StandIn[Backbone]):
         return kinds[key]
 
 
-@contextlib.contextmanager
-def autocast(device: torch.device) -> Iterator[None]:
-    """Autocast to bfloat16, as lerobot's policies do."""
-    with torch.autocast(device.type, torch.bfloat16):
-        yield
-
-
 def wants_gradient(module: nn.Module, vl_input: Mapping[str, Any]) -> bool:
     """Whether a result of the original would have a gradient."""
     if not torch.is_grad_enabled():
@@ -142,17 +112,7 @@ def run(module: nn.Module, backbone: Backbone, vl_input: Mapping[str, Any]) -> T
 
 
 def agree(module: nn.Module, backbone: Backbone, device: torch.device, rounded: bool) -> Kinds:
-    """Compares the original and saccade on the same random view.
-
-    Args:
-        module: The original.
-        backbone: Its copy in saccade.
-        device: Where the original computes.
-        rounded: Whether one of the two rounds to 8 bits.
-
-    Raises:
-        InputError: The features differ.
-    """
+    """Compares both on the same random view; `rounded` if one of them rounds to 8 bits."""
     given = backbones.check_inputs(module, backbone.config, device)
     result = type(module).forward(module, Features(given))
     theirs = result["backbone_features"]

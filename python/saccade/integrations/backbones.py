@@ -6,7 +6,7 @@ begin with `eagle_`.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import torch
@@ -63,20 +63,16 @@ EAGLE_KEYS = (
 )
 
 
-def find(policy: object) -> nn.Module:
-    """The backbone in `policy`.
+#: What is searched for, as a message names it.
+WANTED = (
+    "backbone of GR00T N1.5 (a module with eagle_model and eagle_linear) or N1.7 (a module whose model has "
+    "model.visual and model.language_model)"
+)
 
-    Args:
-        policy: The backbone itself, a module that contains it, or an object that contains such a module.
 
-    Raises:
-        InputError: There is none, or more than one.
-    """
-    wanted = (
-        "backbone of GR00T N1.5 (a module with eagle_model and eagle_linear) or N1.7 (a module whose model "
-        "has model.visual and model.language_model)"
-    )
-    return modules.find(policy, lambda module: is_n15(module) or is_n17(module), wanted)
+def is_wanted(module: nn.Module) -> bool:
+    """Whether a module has the parts of a backbone."""
+    return is_n15(module) or is_n17(module)
 
 
 def is_n15(module: nn.Module) -> bool:
@@ -94,38 +90,19 @@ def is_n17(module: nn.Module) -> bool:
     )
 
 
-def check(module: nn.Module, stand_in: object = None) -> None:
-    """Checks that nothing but the backbone's parameters determines what it computes.
-
-    Args:
-        module: The backbone.
-        stand_in: An accepted replacement of its `forward`.
-
-    Raises:
-        InputError: The message lists every problem.
-    """
+def problems(module: nn.Module, stand_in: object) -> Iterator[str]:
+    """What besides a backbone's parameters determines its results; `stand_in` may replace `forward`."""
     parts = list(module.named_modules())
-    problems = [
-        *modules.in_code(module, NOUN),
-        *modules.in_parameters(module, NOUN),
-        *modules.training(parts, NOUN),
-        *in_use(parts[1:]),
-    ]
+    yield from modules.in_code(module, NOUN)
+    yield from modules.in_parameters(module, NOUN)
+    yield from modules.training(parts, NOUN)
+    yield from modules.replaced_or_hooked(parts[1:], NOUN)
     replaced = vars(module).get("forward")
     if replaced is not stand_in and not modules.is_own(module, "forward"):
-        problems.append(
-            f"its forward has been replaced by {modules.describe(replaced)}: put back that of the class"
-        )
+        yield f"its forward has been replaced by {modules.describe(replaced)}: put back that of the class"
     layers = len(language_model(module).layers)
     if is_n15(module) and module.select_layer not in (layers, -1):
-        problems.append(f"its select_layer is {module.select_layer}, expected its number of layers, {layers}")
-    if problems:
-        raise InputError(f"{type(module).__name__} cannot be accelerated: {'; '.join(problems)}")
-
-
-def in_use(parts: list[tuple[str, nn.Module]]) -> list[str]:
-    """Hooks and replaced methods inside a backbone; `parts` are its submodules, by name."""
-    return list(modules.replaced_or_hooked(parts, NOUN))
+        yield f"its select_layer is {module.select_layer}, expected its number of layers, {layers}"
 
 
 def language_model(module: nn.Module) -> Any:
@@ -140,11 +117,7 @@ def is_padded_as_released(module: nn.Module) -> bool:
 
 
 def config_of(module: nn.Module) -> dict[str, Any]:
-    """The backbone's config, as :meth:`saccade.Backbone.from_tensors` takes it.
-
-    Raises:
-        InputError: It contains values that JSON cannot represent.
-    """
+    """The backbone's config, as :meth:`saccade.Backbone.from_tensors` takes it."""
     inner: Any = module
     language = language_model(module)
     config = inner.eagle_model.config if is_n15(module) else inner.model.config
@@ -192,12 +165,7 @@ def settings_of(module: nn.Module) -> tuple[Any, ...]:
 
 
 def inputs_of(module: nn.Module, vl_input: Mapping[str, Any]) -> BackboneInputs:
-    """What saccade's backbone takes, from what the torch backbone is given.
-
-    Raises:
-        InputError: There are inputs that saccade does not read, or padding that it does not reproduce.
-        ShapeError, DtypeError: A tensor does not fit.
-    """
+    """What saccade's backbone takes; inputs and padding that it does not read are an `InputError`."""
     prefix = "eagle_" if is_n15(module) else ""
     known = ("pixel_values", "input_ids", "attention_mask", "image_sizes")
     unread = [

@@ -12,7 +12,6 @@ from typing import Any
 
 from torch import nn
 
-from saccade.errors import InputError
 from saccade.integrations import modules
 
 #: Attributes of every head, in addition to `get_action`.
@@ -53,19 +52,11 @@ CONFIG_KEYS = (
 )
 
 
-def find(policy: object) -> nn.Module:
-    """The action head in `policy`.
-
-    Args:
-        policy: The head itself, a module that contains it, or an object that contains such a module.
-
-    Raises:
-        InputError: There is none, or more than one.
-    """
-    return modules.find(policy, is_head, f"GR00T action head, a module with get_action, {', '.join(PARTS)},")
+#: What is searched for, as a message names it.
+WANTED = f"GR00T action head, a module with get_action, {', '.join(PARTS)},"
 
 
-def is_head(module: nn.Module) -> bool:
+def is_wanted(module: nn.Module) -> bool:
     """Whether a module has the attributes of an action head."""
     return callable(getattr(module, "get_action", None)) and all(hasattr(module, name) for name in PARTS)
 
@@ -75,27 +66,8 @@ def takes_options(module: nn.Module) -> bool:
     return "options" in inspect.signature(type(module).get_action).parameters  # type: ignore[attr-defined]
 
 
-def check(module: nn.Module, stand_in: object = None) -> None:
-    """Checks that nothing but the head's parameters determines what it computes.
-
-    Args:
-        module: The head.
-        stand_in: An accepted replacement of its `get_action`.
-
-    Raises:
-        InputError: The message lists every problem.
-    """
-    problems = [
-        *in_structure(module, stand_in),
-        *modules.in_parameters(module, NOUN),
-        *in_use(list(module.named_modules())),
-    ]
-    if problems:
-        raise InputError(f"{type(module).__name__} cannot be accelerated: {'; '.join(problems)}")
-
-
-def in_structure(module: nn.Module, stand_in: object) -> Iterator[str]:
-    """Problems in a head's code."""
+def problems(module: nn.Module, stand_in: object) -> Iterator[str]:
+    """What besides a head's parameters determines its results; `stand_in` may replace `get_action`."""
     replaced = vars(module).get("get_action")
     if replaced is not stand_in and not modules.is_own(module, "get_action"):
         yield (
@@ -111,23 +83,18 @@ def in_structure(module: nn.Module, stand_in: object) -> Iterator[str]:
     horizons = [getattr(config, "action_horizon", None), getattr(module, "action_horizon", None)]
     if None in horizons or horizons[0] != horizons[1]:
         yield f"config.action_horizon is {horizons[0]}, but action_horizon is {horizons[1]}"
+    yield from modules.in_parameters(module, NOUN)
+    yield from in_use(list(module.named_modules()))
 
 
 def in_use(parts: list[tuple[str, nn.Module]]) -> Iterator[str]:
-    """Problems that may be temporary: training mode, hooks and replaced methods.
-
-    `parts` are a head and its submodules, by name.
-    """
+    """Problems of a head and its submodules that may be temporary: training mode, hooks, replaced methods."""
     yield from modules.training(parts, NOUN)
     yield from modules.replaced_or_hooked(parts, NOUN)
 
 
 def config_of(module: nn.Module) -> dict[str, Any]:
-    """The head's config in the released names, as in `config.json`.
-
-    Raises:
-        InputError: It contains values that JSON cannot represent.
-    """
+    """The head's config in the released names, as in `config.json`."""
     config = module.config
     # None and "" mean the same as an absent key. The default of model_type in transformers is "".
     values = {key: getattr(config, key, None) for key in CONFIG_KEYS}

@@ -19,11 +19,16 @@ HOLDERS = ("model", "policy", "_groot_model", "action_head")
 RECORDERS = ("transformers.utils.generic", "transformers.utils.output_capturing")
 
 
-def held_by(policy: object) -> nn.Module:
-    """The torch module in `policy`: itself, or what an object contains.
+def find(policy: object, is_wanted: Callable[[nn.Module], bool], wanted: str) -> nn.Module:
+    """The only module in `policy` that is wanted.
+
+    Args:
+        policy: The module itself, a module that contains it, or an object that contains such a module.
+        is_wanted: Whether a module is one.
+        wanted: How a message names it.
 
     Raises:
-        InputError: There is none, or it is compiled.
+        InputError: There is none, or more than one, or it is compiled.
     """
     held: Any = policy
     for _ in range(len(HOLDERS)):
@@ -40,22 +45,8 @@ def held_by(policy: object) -> nn.Module:
             f"policy: {type(held).__name__} is compiled by torch.compile: accelerate the module that was "
             "compiled"
         )
-    return held
-
-
-def find(policy: object, is_wanted: Callable[[nn.Module], bool], wanted: str) -> nn.Module:
-    """The only module in `policy` that is wanted.
-
-    Args:
-        policy: The module itself, a module that contains it, or an object that contains such a module.
-        is_wanted: Whether a module is one.
-        wanted: How a message names it.
-
-    Raises:
-        InputError: There is none, or more than one.
-    """
     found: dict[str, nn.Module] = {
-        name or "itself": module for name, module in held_by(policy).named_modules() if is_wanted(module)
+        name or "itself": module for name, module in held.named_modules() if is_wanted(module)
     }
     if len(found) != 1:
         raise InputError(
@@ -114,25 +105,27 @@ def in_parameters(module: nn.Module, noun: str) -> Iterator[str]:
 
 def training(parts: list[tuple[str, nn.Module]], noun: str) -> Iterator[str]:
     """That parts of a module, given by name, are in training mode."""
-    named = [name or f"the {noun}" for name, part in parts if part.training]
-    if named:
+    if names := named(parts, noun, lambda part: part.training):
         yield (
-            f"{shortened(named)}: in training mode, which has dropout; call eval(), or restore() the "
-            "original during training"
+            f"{names}: in training mode, which has dropout; call eval(), or restore() the original during "
+            "training"
         )
 
 
 def replaced_or_hooked(parts: list[tuple[str, nn.Module]], noun: str) -> Iterator[str]:
     """Replaced methods and forward hooks of parts of a module, given by name."""
-    replaced = [name or f"the {noun}" for name, part in parts if not is_own(part, "forward")]
-    if replaced:
+    if names := named(parts, noun, lambda part: not is_own(part, "forward")):
         yield (
-            f"the forward of {shortened(replaced)} has been replaced: put back that of the class, or "
-            "restore() the original"
+            f"the forward of {names} has been replaced: put back that of the class, or restore() the original"
         )
-    hooked = [name or f"the {noun}" for name, part in parts if is_hooked(part)]
-    if hooked:
-        yield f"{shortened(hooked)}: forward hooks would not run; remove them, or restore() the original"
+    if names := named(parts, noun, is_hooked):
+        yield f"{names}: forward hooks would not run; remove them, or restore() the original"
+
+
+def named(parts: list[tuple[str, nn.Module]], noun: str, is_wanted: Callable[[nn.Module], bool]) -> str:
+    """The first three parts that are wanted, and how many more there are; empty if there are none."""
+    names = [name or f"the {noun}" for name, part in parts if is_wanted(part)]
+    return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
 
 
 def is_hooked(module: nn.Module) -> bool:
@@ -142,11 +135,7 @@ def is_hooked(module: nn.Module) -> bool:
 
 
 def plain(values: dict[str, Any], module: nn.Module) -> dict[str, Any]:
-    """Values of a module's config as JSON represents them.
-
-    Raises:
-        InputError: JSON cannot represent them.
-    """
+    """Values of a module's config as JSON represents them; `InputError` if it cannot."""
     try:
         held: dict[str, Any] = json.loads(json.dumps(values, default=dict))
     except (TypeError, ValueError) as error:
@@ -157,8 +146,3 @@ def plain(values: dict[str, Any], module: nn.Module) -> dict[str, Any]:
 def describe(function: object) -> str:
     """The name of a function for a message."""
     return getattr(function, "__qualname__", None) or type(function).__name__
-
-
-def shortened(names: list[str]) -> str:
-    """The first three names, and how many more there are."""
-    return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")

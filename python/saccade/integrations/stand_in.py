@@ -6,13 +6,15 @@ import copy
 import threading
 import weakref
 from abc import ABC, abstractmethod
-from types import MethodType
+from dataclasses import dataclass
+from types import MethodType, ModuleType
 from typing import Any, ClassVar, Generic, TypeVar
 
 import torch
 from torch import nn
 
 from saccade.errors import DtypeError, InputError
+from saccade.head.options import LoadOptions
 from saccade.integrations import modules
 from saccade.integrations.weights import Watch
 
@@ -36,6 +38,15 @@ class Features(dict[str, Any]):
             raise AttributeError(name) from None
 
 
+@dataclass(frozen=True)
+class Kinds:
+    """What the original returns: the dtypes of its features and of a head's actions, and the class."""
+
+    features: torch.dtype
+    result: type[Any]
+    actions: torch.dtype = torch.float32
+
+
 class StandIn(ABC, Generic[Engine]):
     """Replaces one method of an instance of a torch module.
 
@@ -43,11 +54,13 @@ class StandIn(ABC, Generic[Engine]):
     and pickles of the module have the original method.
     """
 
-    #: The method, and what the module is called in messages.
-    method: ClassVar[str]
-    part: ClassVar[str]
+    #: The method, what the module is called in messages, and the file that knows its structure.
+    _method: ClassVar[str]
+    _part: ClassVar[str]
+    _structure: ClassVar[ModuleType]
 
-    def __init__(self, module: nn.Module) -> None:
+    def __init__(self, module: nn.Module, options: LoadOptions) -> None:
+        self._options = options
         # Weak, since the module refers to this object: a cycle would keep gigabytes until the next
         # collection.
         self._weak_module = weakref.ref(module)
@@ -56,14 +69,6 @@ class StandIn(ABC, Generic[Engine]):
         self._engine: Engine | None = None
         self._watch: Watch | None = None
         self._load(module)
-
-    @abstractmethod
-    def _check(self, module: nn.Module) -> None:
-        """Checks that nothing but weights and settings determines what the module computes."""
-
-    @abstractmethod
-    def _settings_of(self, module: nn.Module) -> object:
-        """What determines the result besides the weights; compared before each call."""
 
     @abstractmethod
     def _convert(self, module: nn.Module) -> Engine:
@@ -76,17 +81,17 @@ class StandIn(ABC, Generic[Engine]):
         Raises:
             InputError: The original was restored, or the policy no longer exists.
         """
-        module = self._weak_module()
-        if module is None or self._restored:
+        module = self._live()
+        if module is None:
             raise InputError(
-                f"{self.part} is no longer accelerated: it was restored, or its policy no longer exists"
+                f"{self._part} is no longer accelerated: it was restored, or its policy no longer exists"
             )
         return module
 
     @property
     def is_restored(self) -> bool:
         """Whether the original is back, or the policy no longer exists."""
-        return self._restored or self._weak_module() is None
+        return self._live() is None
 
     def refresh(self) -> None:
         """Copies the weights again. Needed only after a change that the comparison misses.
@@ -97,40 +102,26 @@ class StandIn(ABC, Generic[Engine]):
         with self._lock:
             self._load(self.module)
 
-    def install(self) -> None:
-        """Puts this object in the place of the method."""
-        self.module.__dict__[self.method] = self
-
-    def check_restorable(self) -> None:
-        """Checks that nothing else has replaced the method since.
-
-        Raises:
-            InputError: Something has.
-        """
-        module = self._weak_module()
-        if module is None or self._restored:
-            return
-        now = vars(module).get(self.method)
-        if now is not self:
-            raise InputError(
-                f"{self.method} was replaced since by {modules.describe(now)}: remove that first, then "
-                "restore"
-            )
-
     def restore(self) -> None:
         """Puts the original method back and frees the weights in saccade. A second call does nothing.
 
         Raises:
             InputError: The method has been replaced by something else in the meantime.
         """
-        self.check_restorable()
-        module = self._weak_module()
-        if module is None or self._restored:
+        self._check_restorable()
+        module = self._live()
+        if module is None:
             return
-        del module.__dict__[self.method]
+        del module.__dict__[self._method]
         with self._lock:
             self._restored = True
             self._engine = self._watch = None
+
+    def __repr__(self) -> str:
+        name = f"saccade.integrations.{type(self).__name__}"
+        if self.is_restored:
+            return f"<{name}, restored>"
+        return f"<{name} {type(self.module).__name__} {self._options}>"
 
     def __deepcopy__(self, memo: dict[int, Any]) -> MethodType:
         """A copy of the policy has the original method."""
@@ -138,11 +129,29 @@ class StandIn(ABC, Generic[Engine]):
 
     def __reduce__(self) -> tuple[Any, ...]:
         """So has a pickle: during unpickling, the name refers to the method of the class."""
-        return getattr, (self.module, self.method)
+        return getattr, (self.module, self._method)
+
+    def _live(self) -> nn.Module | None:
+        """The torch module; None if the original was restored or the policy no longer exists."""
+        return None if self._restored else self._weak_module()
 
     def _original(self) -> MethodType:
         module = self.module
-        return MethodType(getattr(type(module), self.method), module)
+        return MethodType(getattr(type(module), self._method), module)
+
+    def _install(self) -> None:
+        """Puts this object in the place of the method."""
+        self.module.__dict__[self._method] = self
+
+    def _check_restorable(self) -> None:
+        """Refuses if something else has replaced the method since."""
+        module = self._live()
+        now = self if module is None else vars(module).get(self._method)
+        if now is not self:
+            raise InputError(
+                f"{self._method} was replaced since by {modules.describe(now)}: remove that first, then "
+                "restore"
+            )
 
     def _load(self, module: nn.Module) -> None:
         """Copies the weights, and compares the result with the original."""
@@ -152,11 +161,13 @@ class StandIn(ABC, Generic[Engine]):
                 "torch.device('meta')`, or call torch.set_default_device('cpu')"
             )
         self._engine = None  # so that there are never two copies in memory
-        self._check(module)
+        if problems := list(self._structure.problems(module, self)):
+            raise InputError(f"{type(module).__name__} cannot be accelerated: {'; '.join(problems)}")
         # Before the weights are read, so that the next call detects changes during the reading.
         self._watch = Watch(module)
-        self._settings = self._settings_of(module)
+        self._settings = self._structure.settings_of(module)
         self._parts = list(module.named_modules())[1:]  # without the module itself, see _weak_module
+        self._kinds: dict[tuple[Any, ...], Kinds] = {}
         self._engine = self._convert(module)
 
     def _current(self, module: nn.Module) -> Engine:
@@ -164,7 +175,8 @@ class StandIn(ABC, Generic[Engine]):
         # In this order, so that a load in another thread can make a current copy look stale, but not vice
         # versa.
         watch, engine = self._watch, self._engine
-        if engine is None or watch is None or self._settings != self._settings_of(module) or watch.changed():
+        settings = self._structure.settings_of(module)
+        if engine is None or watch is None or self._settings != settings or watch.changed():
             with self._lock:
                 # Another thread may have loaded it in the meantime.
                 if self._engine is None or self._engine is engine:

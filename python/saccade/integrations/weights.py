@@ -28,27 +28,22 @@ class Watch:
             (part._modules, name, part._modules[name]) for part in modules for name in part._modules
         ]
         self._parameters = [
-            (part._parameters, name, parameter, version(parameter), parameter.data_ptr())
+            (part._parameters, name, parameter, place(parameter))
             for part in modules
             for name, parameter in part._parameters.items()
             if parameter is not None
         ]
-        self._samples = [sample(parameter) for _, _, parameter, _, _ in self._parameters]
+        self._samples = [sample(parameter) for _, _, parameter, _ in self._parameters]
         self._values = self._sampled()
 
     def changed(self) -> bool:
         """Whether a change is detected."""
         if any(len(children) != count for children, count in self._counts):
             return True
-        for modules, name, child in self._children:
-            if modules.get(name) is not child:
-                return True
-        for parameters, name, parameter, counted, address in self._parameters:
-            if (
-                parameters.get(name) is not parameter
-                or parameter.data_ptr() != address
-                or version(parameter) != counted
-            ):
+        if any(modules.get(name) is not child for modules, name, child in self._children):
+            return True
+        for parameters, name, parameter, before in self._parameters:
+            if parameters.get(name) is not parameter or place(parameter) != before:
                 return True
         return self._sampled() != self._values
 
@@ -57,9 +52,9 @@ class Watch:
         return torch.cat(self._samples).float().cpu().numpy().tobytes()
 
 
-def version(parameter: Tensor) -> int:
-    """The count of in-place changes that torch keeps. Tensors created in inference mode have none."""
-    return 0 if parameter.is_inference() else parameter._version
+def place(parameter: Tensor) -> tuple[int, int]:
+    """Address, and torch's count of in-place changes. Tensors created in inference mode have none."""
+    return parameter.data_ptr(), 0 if parameter.is_inference() else parameter._version
 
 
 def sample(parameter: Tensor) -> Tensor:
