@@ -12,8 +12,7 @@ import pytest
 
 import saccade
 from saccade import cli
-from saccade._internal.flags import UsageError, add_num_threads
-from saccade._internal.policy_flags import add_policy_options, policy_options
+from saccade._internal.flags import UsageError, add_num_threads, add_policy_options, policy_options
 from saccade.checkpoints import inspection
 from saccade_lab.sim import episodes, policy
 

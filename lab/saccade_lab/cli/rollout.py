@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from saccade._internal import flags as arguments
 from saccade._internal.files import write_atomically, write_json
-from saccade._internal.policy_flags import add_data_config, add_overrides
+from saccade._internal.flags import add_data_config, add_overrides
 from saccade.cli import EXIT_INTERRUPTED, EXIT_OK, output
 from saccade.errors import SaccadeError
 from saccade_lab import flags as lab_flags

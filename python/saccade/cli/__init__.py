@@ -19,7 +19,6 @@ import sys
 import threading
 import warnings
 from collections.abc import Iterator, Sequence
-from types import ModuleType
 from typing import NoReturn, Protocol, runtime_checkable
 
 from saccade._internal import extras
@@ -118,20 +117,19 @@ class Parser(argparse.ArgumentParser):
 
 
 def load_command(name: str) -> Command:
-    """The module of a command.
-
-    Args:
-        name: A key of `COMMANDS` or `LAB_COMMANDS`.
-
-    Raises:
-        KeyError: There is no such command.
-        UsageError: It is a command of the lab, which is not installed.
-        TypeError: Its module lacks a part of `Command`.
-    """
+    """The module of a command; a `UsageError` for one of the lab, if that is not installed."""
     if name in COMMANDS:
         module = importlib.import_module(f"saccade.cli.{name}")
     elif name in LAB_COMMANDS:
-        module = lab_command(name)
+        # Entry points of other distributions are not asked: a name has one meaning.
+        try:
+            (entry,) = importlib.metadata.distribution(LAB).entry_points.select(group=ENTRY_POINTS, name=name)
+        except (importlib.metadata.PackageNotFoundError, ValueError):
+            install = extras.SACCADE.install_lab()
+            raise UsageError(
+                f"{name}: needs {LAB}, which is not installed. Install with: {install}"
+            ) from None
+        module = entry.load()
     else:
         raise KeyError(name)
     if not isinstance(module, Command):
@@ -139,28 +137,8 @@ def load_command(name: str) -> Command:
     return module
 
 
-def lab_command(name: str) -> ModuleType:
-    """The module of a command of the lab.
-
-    Raises:
-        UsageError: The lab is not installed.
-    """
-    # Entry points of other distributions are not asked: a name has one meaning.
-    try:
-        (entry,) = importlib.metadata.distribution(LAB).entry_points.select(group=ENTRY_POINTS, name=name)
-    except (importlib.metadata.PackageNotFoundError, ValueError):
-        install = extras.SACCADE.install_lab()
-        raise UsageError(f"{name}: needs {LAB}, which is not installed. Install with: {install}") from None
-    module: ModuleType = entry.load()
-    return module
-
-
 def build_parser(chosen: str | None = None) -> argparse.ArgumentParser:
-    """The parser of the command line. Only the arguments of the chosen command are declared.
-
-    Args:
-        chosen: The command whose module is imported; None or an unknown name imports none.
-    """
+    """The parser of the command line, with the arguments of the chosen command; no other is imported."""
     parser = Parser(
         prog="saccade",
         description="Run GR00T-style robot policies on CPUs: act, serve, inspect and convert checkpoints.",
@@ -195,11 +173,7 @@ def describe(error: BaseException) -> str:
 
 
 def require(command: str) -> None:
-    """Checks that the optional packages of a command are installed, without importing them.
-
-    Raises:
-        MissingExtraError: Names those that are missing and a command that installs them.
-    """
+    """Checks that the optional packages of a command are installed; `MissingExtraError` names the others."""
     extras.SACCADE.require(*NEEDS[command])
 
 

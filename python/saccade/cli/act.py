@@ -6,13 +6,12 @@ import argparse
 import time
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from saccade._internal import flags as arguments
-from saccade._internal.flags import UsageError
-from saccade._internal.policy_flags import add_policy_options, policy_options
+from saccade._internal.flags import UsageError, add_policy_options, policy_options
 from saccade.cli import EXIT_OK, output, require
 from saccade.cli.tables import Section, show
 
@@ -96,7 +95,16 @@ def run(args: argparse.Namespace) -> int:
     actions = policy.sample(context, given, seed=args.seed, num_steps=args.num_steps)
     clock.done("sample")
     if args.json:
-        output.print_json(report(args, policy, inputs[0].input_ids.shape[1], actions, clock))
+        report = {
+            "checkpoint": str(args.checkpoint),
+            "embodiment": policy.normalizer.embodiment,
+            "embodiment_id": policy.embodiment_id,
+            "precision": policy_options(args)["precision"],
+            "num_vl_tokens": inputs[0].input_ids.shape[1],
+            "actions": {key: part[0].tolist() for key, part in actions.items()},
+            "milliseconds": clock.milliseconds,
+        }
+        output.print_json(report)
         return EXIT_OK
     assumed = [
         *(["random frames"] if not pictures else []),
@@ -145,7 +153,7 @@ def chunk(policy: Policy, actions: Mapping[str, Float32Array]) -> Section:
     """The chunk: a row for each step, a column for each number."""
     columns = [">step"]
     for key, part in actions.items():
-        columns += [f">{key}" if number == 0 else ">" for number in range(part.shape[-1])]
+        columns += [f">{key}", *[">"] * (part.shape[-1] - 1)]
     joined = np.concatenate([part[0] for part in actions.values()], axis=-1)
     rows = [[str(step), *(f"{value:.4f}" for value in row)] for step, row in enumerate(joined)]
     robot = policy.normalizer.embodiment or policy.embodiment_id
@@ -159,22 +167,3 @@ def times(clock: Clock) -> Section:
     rest = sum(spent.values()) - spent["load"]
     rows.append(["all but load", f"{rest:,.1f}", "the first call; later ones need not allocate memory"])
     return Section("Time", ["", ">ms", ""], rows)
-
-
-def report(
-    args: argparse.Namespace,
-    policy: Policy,
-    num_tokens: int,
-    actions: Mapping[str, Float32Array],
-    clock: Clock,
-) -> dict[str, Any]:
-    """Everything as values for JSON."""
-    return {
-        "checkpoint": str(args.checkpoint),
-        "embodiment": policy.normalizer.embodiment,
-        "embodiment_id": policy.embodiment_id,
-        "precision": policy_options(args)["precision"],
-        "num_vl_tokens": num_tokens,
-        "actions": {key: part[0].tolist() for key, part in actions.items()},
-        "milliseconds": clock.milliseconds,
-    }

@@ -10,8 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from saccade._internal import flags as arguments
-from saccade._internal.flags import UsageError
-from saccade._internal.policy_flags import add_data_config, add_overrides
+from saccade._internal.flags import UsageError, add_data_config, add_overrides
 from saccade.cli import EXIT_OK, output, precisions
 from saccade.cli.tables import Section, show
 

@@ -8,8 +8,7 @@ import sys
 from typing import TYPE_CHECKING
 
 from saccade._internal import flags as arguments
-from saccade._internal.flags import UsageError
-from saccade._internal.policy_flags import add_policy_options, policy_options
+from saccade._internal.flags import UsageError, add_policy_options, policy_options
 from saccade.cli import EXIT_INTERRUPTED, EXIT_OK, require
 from saccade.serve.limits import Limits
 
