@@ -244,21 +244,11 @@ class Accelerated(StandIn[ActionHead]):
             self._kinds_of(module, head, like, like)
         return head
 
-    def _kinds_of(self, module: nn.Module, head: ActionHead, features: Tensor, state: Tensor) -> Kinds:
-        """The dtypes of the original's results for these inputs under the current autocast.
-
-        For a new combination the original runs on four tokens, and saccade must agree.
-        """
-        device = features.device.type
-        autocast = torch.is_autocast_enabled(device) and torch.get_autocast_dtype(device)
-        key = (features.dtype, state.dtype, device, autocast)
-        kinds = self._kinds  # another thread may replace it when weights change
-        if key not in kinds:
-            reduced = bool(autocast) or features.dtype != torch.float32
-            rounded = reduced or self._options["precision"] != "float32"
-            inputs = check_inputs(module, head, features, state)
-            kinds[key] = agree(module, head, inputs, rounded)
-        return kinds[key]
+    def _compare(self, module: nn.Module, engine: ActionHead, autocast: bool, *like: Tensor) -> Kinds:
+        features, state = like
+        reduced = autocast or features.dtype != torch.float32
+        rounded = reduced or self._options["precision"] != "float32"
+        return agree(module, engine, check_inputs(module, engine, features, state), rounded)
 
     def _chunk(
         self, action_input: Any, options: Mapping[str, Any] | None, dtype: torch.dtype

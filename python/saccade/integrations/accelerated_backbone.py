@@ -61,9 +61,9 @@ class AcceleratedBackbone(StandIn[Backbone]):
             raise InputError(f"{type(module).__name__}.forward: {'; '.join(problems)}")
         with torch.no_grad():
             backbone = self._current(module)
-            device = next(module.parameters()).device
-            kinds = self._kinds_of(module, backbone, device)
-            features = run(module, backbone, vl_input).to(device, kinds.features)
+            like = next(module.parameters())
+            kinds = self._kinds_of(module, backbone, like)
+            features = run(module, backbone, vl_input).to(like.device, kinds.features)
             return kinds.result(data=backbones.results_of(module, vl_input, features))
 
     def _convert(self, module: nn.Module) -> Backbone:
@@ -76,26 +76,15 @@ class AcceleratedBackbone(StandIn[Backbone]):
         parameters = list(module.parameters())
         # With parameters of mixed dtypes, the original works under autocast only.
         mixed = len({parameter.dtype for parameter in parameters}) > 1
-        device = parameters[0].device
         with torch.no_grad(), contextlib.ExitStack() as stack:
             if mixed or self._autocast:  # as lerobot's policies call it
-                stack.enter_context(torch.autocast(device.type, torch.bfloat16))
-            self._kinds_of(module, backbone, device)
+                stack.enter_context(torch.autocast(parameters[0].device.type, torch.bfloat16))
+            self._kinds_of(module, backbone, parameters[0])
         return backbone
 
-    def _kinds_of(self, module: nn.Module, backbone: Backbone, device: torch.device) -> Kinds:
-        """The dtype of the original's features under the current autocast.
-
-        For a new combination the original runs on a random view, and saccade must agree.
-        """
-        to = torch.is_autocast_enabled(device.type) and torch.get_autocast_dtype(device.type)
-        key = (device.type, to)
-        kinds = self._kinds  # another thread may replace it when weights change
-        if key not in kinds:
-            reduced = bool(to) or any(p.dtype != torch.float32 for p in module.parameters())
-            rounded = reduced or backbone.precision != "float32"
-            kinds[key] = agree(module, backbone, device, rounded)
-        return kinds[key]
+    def _compare(self, module: nn.Module, engine: Backbone, autocast: bool, *like: Tensor) -> Kinds:
+        reduced = autocast or any(p.dtype != torch.float32 for p in module.parameters())
+        return agree(module, engine, like[0].device, reduced or engine.precision != "float32")
 
 
 def wants_gradient(module: nn.Module, vl_input: Mapping[str, Any]) -> bool:

@@ -11,7 +11,7 @@ from types import MethodType, ModuleType
 from typing import Any, ClassVar, Generic, TypeVar
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from saccade.errors import DtypeError, InputError
 from saccade.head.options import LoadOptions
@@ -72,7 +72,11 @@ class StandIn(ABC, Generic[Engine]):
 
     @abstractmethod
     def _convert(self, module: nn.Module) -> Engine:
-        """A copy of the weights in saccade, compared with the original."""
+        """A copy of the weights in saccade, compared with the original by `_kinds_of`."""
+
+    @abstractmethod
+    def _compare(self, module: nn.Module, engine: Engine, autocast: bool, *like: Tensor) -> Kinds:
+        """Runs both on random inputs like these, and refuses if they differ."""
 
     @property
     def module(self) -> nn.Module:
@@ -169,6 +173,16 @@ class StandIn(ABC, Generic[Engine]):
         self._parts = list(module.named_modules())[1:]  # without the module itself, see _weak_module
         self._kinds: dict[tuple[Any, ...], Kinds] = {}
         self._engine = self._convert(module)
+
+    def _kinds_of(self, module: nn.Module, engine: Engine, *like: Tensor) -> Kinds:
+        """What the original returns for inputs like these under the current autocast; compared when new."""
+        device = like[0].device.type
+        autocast = torch.is_autocast_enabled(device) and torch.get_autocast_dtype(device)
+        key = (device, autocast, *(one.dtype for one in like))
+        kinds = self._kinds  # another thread may replace it when weights change
+        if key not in kinds:
+            kinds[key] = self._compare(module, engine, bool(autocast), *like)
+        return kinds[key]
 
     def _current(self, module: nn.Module) -> Engine:
         """The copy in saccade with the current weights."""
