@@ -13,7 +13,7 @@ import numpy as np
 from saccade._internal import flags as arguments
 from saccade._internal.flags import UsageError, add_policy_options, policy_options
 from saccade.cli import EXIT_OK, output, require
-from saccade.cli.tables import Section, show
+from saccade.cli.output import Section, show
 
 if TYPE_CHECKING:
     from saccade._internal.arrays import Float32Array

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from saccade._internal import flags as arguments
 from saccade._internal.flags import UsageError, add_data_config, add_overrides
 from saccade.cli import EXIT_OK, output, precisions
-from saccade.cli.tables import Section, show
+from saccade.cli.output import Section, show
 
 if TYPE_CHECKING:
     from saccade.checkpoints.findings import Inspection, Resemblance, Spread, TokenStatistics
@@ -105,15 +105,17 @@ def sections(report: Inspection) -> list[Section]:
 def checkpoint(report: Inspection) -> Section:
     """What the checkpoint is, and the evidence for it."""
     size = sum(file.nbytes for file in report.files)
-    outside = [f"{counts.tensors} tensors, {megabytes(counts.nbytes)} MB of {name}"
-              for name, counts in report.outside.items()]  # fmt: skip
+    outside = [
+        f"{counts.tensors} tensors, {megabytes(counts.nbytes)} MB of {name}"
+        for name, counts in report.outside.items()
+    ]
     rows = [
         ["version", f"GR00T {report.version.upper()}"],
         ["layout", report.layout],
         ["files", f"{len(report.files)}, {megabytes(size)} MB"],
         ["prefix of the head", report.prefix or "none"],
         ["outside the head", "; ".join(outside) or "nothing"],
-        *([["evidence" if index == 0 else "", what] for index, what in enumerate(report.evidence)]),
+        *listed("evidence", report.evidence),
     ]
     return Section(str(report.source), ["", ""], rows)
 
@@ -299,12 +301,13 @@ def reference(found: Resemblance) -> Section:
 
 def from_noise(found: Mapping[str, Sequence[str]]) -> Section:
     """The evidence on a random start."""
-    rows = [
-        [side if index == 0 else "", sentence]
-        for side in ("for", "against", "neither")
-        for index, sentence in enumerate(found[side])
-    ]
+    rows = [row for side in ("for", "against", "neither") for row in listed(side, found[side])]
     return Section('Evidence on "it was trained from a random start"', ["", ""], rows or [["", "none"]])
+
+
+def listed(name: str, values: Sequence[str]) -> list[list[str]]:
+    """A row for each value, the first with the name."""
+    return [[name if index == 0 else "", value] for index, value in enumerate(values)]
 
 
 def megabytes(nbytes: int) -> str:

@@ -10,7 +10,8 @@ import os
 import sys
 import time
 import unicodedata
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Protocol
 
 from saccade._internal.json import dumps
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
 #: Characters of our texts, and what is written where the encoding of a stream lacks them.
 ASCII = {"–": "-", "—": "-", "×": "x", "·": "*", "…": "...", "“": '"', "”": '"', "→": "->", "±": "+-"}
 LINE_SECONDS = 60.0  # between two lines of progress
+WIDTH = 110  # characters in a line of tables where the output is not a terminal
 REPLACE = "saccade-ascii"  # name of the error handler
 
 
@@ -118,6 +120,49 @@ def console(*, stderr: bool = False, width: int | None = None) -> Console:
     if width is not None and not made.is_terminal and "COLUMNS" not in os.environ:
         made.width = width
     return made
+
+
+@dataclass(frozen=True)
+class Section:
+    """A table; columns whose names begin with ">" are numbers, aligned right."""
+
+    title: str
+    columns: Sequence[str]
+    rows: Sequence[Sequence[str]]
+
+
+def show(tables: Sequence[Section]) -> None:
+    """Prints the tables: with rich if it is installed, else in plain columns."""
+    try:
+        from rich.table import Table
+        from rich.text import Text
+    except ModuleNotFoundError:
+        print("\n\n".join(map(plain, tables)))
+        return
+    shown = console(width=WIDTH)
+    for section in tables:
+        shown.print(Text(section.title, style="bold"))
+        table = Table(box=None, show_header=any(column.lstrip(">") for column in section.columns))
+        for column in section.columns:
+            table.add_column(column.lstrip(">"), justify="right" if column.startswith(">") else "left")
+        for row in section.rows:
+            table.add_row(*map(Text, row))
+        shown.print(table)
+        shown.print()
+
+
+def plain(section: Section) -> str:
+    """A table as text in plain columns."""
+    rows = [[column.lstrip(">") for column in section.columns], *section.rows]
+    widths = [max(len(row[index]) for row in rows) for index in range(len(section.columns))]
+    lines = [
+        "  ".join(
+            cell.rjust(width) if column.startswith(">") else cell.ljust(width)
+            for cell, width, column in zip(row, widths, section.columns, strict=True)
+        ).rstrip()
+        for row in rows
+    ]
+    return "\n".join([section.title, *lines])
 
 
 class Update(Protocol):

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from saccade._internal.flags import UsageError
 from saccade.cli import EXIT_OK, output, require
-from saccade.cli.tables import Section, show
+from saccade.cli.output import Section, show
 
 if TYPE_CHECKING:
     from saccade.checkpoints.precisions import Difference, PrecisionCheck
