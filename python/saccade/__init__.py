@@ -16,9 +16,6 @@ from saccade.backbone.backbone import Backbone
 from saccade.backbone.config import BackboneConfig
 from saccade.backbone.features import BackboneFeatures, BackboneRecord
 from saccade.backbone.inputs import BackboneInputs
-from saccade.checkpoints.bundled import demo_checkpoint
-from saccade.checkpoints.inspection import inspect
-from saccade.checkpoints.rewriting import convert, quantize, resize
 from saccade.errors import (
     CheckpointError,
     DtypeError,
@@ -40,7 +37,8 @@ from saccade.processor import Processor
 from saccade.robots.normalizer import Normalizer
 
 if TYPE_CHECKING:
-    from saccade.integrations import accelerate as accelerate
+    from saccade.checkpoints import convert, demo_checkpoint, inspect, quantize, resize
+    from saccade.integrations import accelerate
 
 __all__ = [
     "ActionHead",
@@ -77,15 +75,20 @@ __all__ = [
     "show_config",
 ]
 
-#: Public submodules, imported when they are first used.
+#: Functions whose modules are imported when they are first used: a robot needs none of them, one needs torch.
+_FUNCTIONS = {
+    **dict.fromkeys(("convert", "demo_checkpoint", "inspect", "quantize", "resize"), "saccade.checkpoints"),
+    "accelerate": "saccade.integrations",
+}
+#: Public submodules, likewise.
 _SUBMODULES = ("checkpoints", "integrations", "observations", "robots", "serve", "torch")
 
 # Hidden from type checkers, so that they report names that do not exist; they need `import saccade.serve`.
 if not TYPE_CHECKING:
 
     def __getattr__(name: str) -> Any:
-        if name == "accelerate":  # needs torch
-            return importlib.import_module("saccade.integrations").accelerate
+        if name in _FUNCTIONS:
+            return getattr(importlib.import_module(_FUNCTIONS[name]), name)
         if name in _SUBMODULES:
             return importlib.import_module(f"saccade.{name}")
         raise AttributeError(f"module 'saccade' has no attribute {name!r}")
