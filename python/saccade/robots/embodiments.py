@@ -19,6 +19,8 @@ _RELEASED = json.loads(Path(__file__).with_name("released_embodiments.json").rea
 N15_IDS: Mapping[str, int] = _RELEASED["ids"]["n1.5"]
 N16_IDS: Mapping[str, int] = _RELEASED["ids"]["n1.6"]
 N17_IDS: Mapping[str, int] = _RELEASED["ids"]["n1.7"]
+#: The ids of lerobot's own table for N1.5, where a step has none.
+LEROBOT_N15_IDS: Mapping[str, int] = _RELEASED["ids"]["lerobot n1.5"]
 
 #: Released ids by version of the model.
 IDS: Mapping[str, Mapping[str, int]] = {"n1": N15_IDS, "n1.5": N15_IDS, "n1.6": N16_IDS, "n1.7": N17_IDS}

@@ -24,14 +24,11 @@ CLASSES = {"Gr00tN1d6Processor": "n1.6", "Gr00tN1d7Processor": "n1.7"}
 OPTIONS: list[str] = KNOWN["isaac"]["processor"]
 N17_OPTIONS: list[str] = KNOWN["isaac"]["processor_n1.7"]
 
+#: Options that are on or off, with the released defaults.
+SWITCHES: Mapping[str, bool] = KNOWN["isaac"]["switches"]
+
 #: Fields of a modality config, and of one of its action configs with the values that are known.
-MODALITY = (
-    "delta_indices",
-    "modality_keys",
-    "sin_cos_embedding_keys",
-    "mean_std_embedding_keys",
-    "action_configs",
-)
+MODALITY: list[str] = KNOWN["isaac"]["modality"]
 ACTION = {
     "rep": ("RELATIVE", "DELTA", "ABSOLUTE"),
     "type": ("EEF", "NON_EEF"),
@@ -139,16 +136,6 @@ def _needs(config: Any) -> str:
     return "; ".join(
         f"{kind} {', '.join(map(str, keys))}" for kind, keys in found.items() if isinstance(keys, list)
     )
-
-
-#: Options that are on or off, with the released defaults.
-SWITCHES = {
-    "use_percentiles": False,
-    "clip_outliers": True,
-    "apply_sincos_state_encoding": False,
-    "use_relative_action": False,
-    "exclude_state": False,
-}
 
 
 def _switch(builder: Builder, kwargs: Mapping[str, Any], name: str, default: bool) -> bool:

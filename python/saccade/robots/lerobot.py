@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from saccade.robots.building import Builder, Options, size_of, value_at, width_of
-from saccade.robots.embodiments import N17_IDS
+from saccade.robots.embodiments import LEROBOT_N15_IDS, N17_IDS
 from saccade.robots.groups import Group
 from saccade.robots.isaac_processor import (
     Modality,
@@ -34,16 +34,6 @@ STATE, ACTION = "observation.state", "action"
 #: LIBERO's gripper is the last number of an action with at least this many.
 LIBERO_WIDTH = 7
 
-#: The ids of lerobot's own tables, where a step has none.
-N15_MAPPING = {
-    "new_embodiment": 31,
-    "oxe_droid": 17,
-    "agibot_genie1": 26,
-    "gr1": 24,
-    "so100": 2,
-    "unitree_g1": 3,
-}
-
 
 def lerobot_robot(folder: Path, preprocessor: Mapping[str, Any], options: Options) -> Robot | None:
     """The robot of a checkpoint's directory; None if ``preprocessor`` has no step of GR00T."""
@@ -53,7 +43,10 @@ def lerobot_robot(folder: Path, preprocessor: Mapping[str, Any], options: Option
     options.refuse_data_config(pipeline.where)
     taking, giving = pipeline.pack.config, pipeline.unpack.config
     tag = str(taking.get("embodiment_tag", "new_embodiment"))
-    embodiment_id = _mapping(pipeline).get(tag, 0)  # as lerobot does with an unknown tag
+    given = taking.get("embodiment_mapping")
+    released = N17_IDS if pipeline.is_n17 else LEROBOT_N15_IDS
+    ids = released if given is None else checked_ids(pipeline.where, given)
+    embodiment_id = ids.get(tag, 0)  # as lerobot does with an unknown tag
     options.check_only(tag, embodiment_id, "n1.7" if pipeline.is_n17 else "n1.5", pipeline.where)
     builder = Builder(pipeline.where, np.float32)
     for step in (pipeline.pack, pipeline.unpack):
@@ -63,8 +56,8 @@ def lerobot_robot(folder: Path, preprocessor: Mapping[str, Any], options: Option
     action = _native_groups(builder, pipeline, state) if native else _flat_groups(builder, pipeline)
     width = sum(group.size for group in action)
     # lerobot replaces what N1.5's step says by the width in config.json.
-    given = size_of(giving.get("env_action_dim")) if pipeline.is_n17 else None
-    cut = min(given or width, pipeline.feature("output_features", ACTION) or width)
+    said = size_of(giving.get("env_action_dim")) if pipeline.is_n17 else None
+    cut = min(said or width, pipeline.feature("output_features", ACTION) or width)
     if cut < width:
         action, width = _cut(builder, action, cut), cut
     gripper = _libero(builder, pipeline, action, native)
@@ -93,13 +86,6 @@ def lerobot_robot(folder: Path, preprocessor: Mapping[str, Any], options: Option
     )
 
 
-def _mapping(pipeline: Pipeline) -> dict[str, int]:
-    given = pipeline.pack.config.get("embodiment_mapping")
-    if given is not None:
-        return checked_ids(pipeline.where, given)
-    return dict(N17_IDS) if pipeline.is_n17 else dict(N15_MAPPING)
-
-
 def _state_groups(builder: Builder, pipeline: Pipeline) -> tuple[Group, ...]:
     """The state: one group, or with a raw checkpoint's statistics one for each of its keys."""
     config, found = pipeline.pack.config, pipeline.pack.statistics.get(STATE)
@@ -112,12 +98,9 @@ def _state_groups(builder: Builder, pipeline: Pipeline) -> tuple[Group, ...]:
         return tuple(Group(key, width, "none") for key, width in parts)
     low, high = (_fitted(builder, STATE, found, name, size, fill) for name, fill in (("min", 0), ("max", 1)))
     clips = bool(pipeline.is_n17 and config.get("clip_outliers", True))
-    groups, start = [], 0
-    for key, width in parts:
-        part = slice(start, start + width)
-        groups.append(builder.scaled(key, "min_max", low[part], high[part], clips=clips))
-        start += width
-    return tuple(groups)
+    ends = np.cumsum([width for _, width in parts])[:-1]
+    rows = zip(parts, np.split(low, ends), np.split(high, ends), strict=True)
+    return tuple(builder.scaled(key, "min_max", *bounds, clips=clips) for (key, _), *bounds in rows)
 
 
 def _parts(pipeline: Pipeline, size: int) -> list[tuple[str, int]]:
@@ -269,11 +252,9 @@ def _libero(builder: Builder, pipeline: Pipeline, action: tuple[Group, ...], nat
     width = sum(group.size for group in action)
     if not native:
         return width - 1 if width >= LIBERO_WIDTH else None
-    start = 0
-    for group in action:
+    for place, group in enumerate(action):
         if group.key == "gripper" and group.size == 1:
-            return start
-        start += group.size
+            return sum(one.size for one in action[:place])
     builder.problems.append("libero: expected a group gripper of one number among the actions")
     return None
 
