@@ -11,7 +11,8 @@ import numpy as np
 import numpy.typing as npt
 
 import saccade._saccade as _saccade
-from saccade._internal.arrays import ArrayLike, Float32Array, frame, int64, integer, text
+from saccade._internal.arrays import ArrayLike, Float32Array, frame, int64, integer
+from saccade._internal.arrays import text as checked_text
 from saccade._internal.tokenizers import given_tokenizer, processor_source, tokenizer_of
 from saccade.backbone.inputs import BackboneInputs
 from saccade.errors import InputError, ShapeError
@@ -57,9 +58,15 @@ class Processor:
     Example:
         >>> import numpy as np, saccade
         >>> processor = saccade.Processor("n1.5", "tokenizer.json")
-        >>> inputs = processor({"front": np.zeros((480, 640, 3), np.uint8)}, "open the drawer")
+        >>> frames = {"front": np.zeros((480, 640, 3), np.uint8)}
+        >>> inputs = processor(frames, "open the drawer")
         >>> inputs.pixel_values.shape, inputs.view_names
         ((1, 3, 224, 224), ('front',))
+        >>> inputs = processor([frames, frames], ["push", "open the drawer"])
+        >>> inputs.input_ids.shape, inputs.attention_mask.sum(axis=1)
+        ((2, 294), array([292, 294]))
+        >>> processor.texts(processor.tokens("push the puck"))
+        ['push', ' the', ' ', 'pu', 'ck']
     """
 
     def __init__(
@@ -76,9 +83,9 @@ class Processor:
         if not isinstance(plain_text, bool):
             raise InputError(f"plain_text: expected True or False, got {plain_text!r}")
         self._processor = _saccade.Processor(
-            text("version", version),
+            checked_text("version", version),
             given_tokenizer(tokenizer),
-            None if preprocessing is None else text("preprocessing", preprocessing),
+            _optional("preprocessing", preprocessing),
             None if image_size is None else integer("image_size", image_size),
             None if tokens_per_view is None else integer("tokens_per_view", tokens_per_view),
             plain_text,
@@ -102,11 +109,9 @@ class Processor:
         ``policy_preprocessor.json``. A checkpoint that holds only a backbone will do.
 
         Args:
-            id_or_path: A path or the id of a published checkpoint, as for
-                :meth:`saccade.ActionHead.from_pretrained`.
-            revision: A branch, tag or commit of the id. Default: ``main``.
-            preprocessing: The program that the checkpoint was trained with. Default: lerobot for a
-                checkpoint that lerobot wrote, otherwise Isaac-GR00T.
+            id_or_path, revision: As for :meth:`saccade.ActionHead.from_pretrained`.
+            preprocessing: As for the class. Default: lerobot for a checkpoint that lerobot wrote, otherwise
+                Isaac-GR00T.
             tokenizer: A ``tokenizer.json``, a directory, or the id of a published tokenizer. Default: the
                 checkpoint's own, otherwise the published tokenizer of its release.
             options: Options that replace those of the checkpoint, such as ``{"letter_box_transform": True}``,
@@ -127,7 +132,7 @@ class Processor:
             <saccade.Processor version=n1.5 preprocessing=lerobot image_size=56 tokens_per_view=16 tokens=443>
         """
         held = processor_source(id_or_path, revision)
-        chosen = None if preprocessing is None else text("preprocessing", preprocessing)
+        chosen = _optional("preprocessing", preprocessing)
         processor = cls.__new__(cls)
         replaced = None if options is None else _to_json(options)
         processor._processor = _saccade.Processor.load(held, tokenizer_of(held, tokenizer), chosen, replaced)
@@ -182,35 +187,16 @@ class Processor:
                 instruction is too long, contains a token that stands for an image, or a placeholder such as
                 ``<image-2>``, which the released N1.5 would replace by another copy of a frame.
             MemoryError: There is not enough memory.
-
-        Example:
-            >>> import numpy as np, saccade
-            >>> processor = saccade.Processor("n1.5", "tokenizer.json")
-            >>> frames = {"front": np.zeros((480, 640, 3), np.uint8)}
-            >>> inputs = processor([frames, frames], ["push", "open the drawer"])
-            >>> inputs.input_ids.shape, inputs.attention_mask.sum(axis=1)
-            ((2, 294), array([292, 294]))
         """
         observations, instructions = _batch(frames, instruction)
-        names = None if view_names is None else [text("view_names", name) for name in view_names]
-        prepared = self._processor.process(
-            [
-                (
-                    _views(observation, names),
-                    not isinstance(observation, Mapping),
-                    None if task is None else text("instruction", task),
-                )
-                for observation, task in zip(observations, instructions, strict=True)
-            ],
-            bool(plain_text),
-        )
-        pixels, input_ids, attention_mask, grid, found = prepared
+        names = None if view_names is None else [checked_text("view_names", name) for name in view_names]
+        given = [
+            (_views(seen, names), not isinstance(seen, Mapping), _optional("instruction", task))
+            for seen, task in zip(observations, instructions, strict=True)
+        ]
+        pixels, ids, mask, grid, found = self._processor.process(given, bool(plain_text))
         return BackboneInputs(
-            pixels if self.version == "n1.6" else pixels[0],
-            input_ids,
-            attention_mask,
-            grid,
-            view_names=found,
+            pixels if self.version == "n1.6" else pixels[0], ids, mask, grid, view_names=found
         )
 
     def frame(self, image: ArrayLike) -> Float32Array:
@@ -235,13 +221,8 @@ class Processor:
 
         Raises:
             InputError: It is not text, or longer than 256 kB.
-
-        Example:
-            >>> import saccade
-            >>> saccade.Processor("n1.5", "tokenizer.json").tokens("push")
-            array([389])
         """
-        return self._processor.tokens(_text("text", text))
+        return self._processor.tokens(checked_text("text", text))
 
     def texts(self, ids: ArrayLike | Sequence[int]) -> list[str]:
         """The text of each of these tokens.
@@ -252,12 +233,6 @@ class Processor:
         Raises:
             ShapeError: ``ids`` does not have one axis.
             InputError: They are not integers, or an id is not that of a token.
-
-        Example:
-            >>> import saccade
-            >>> processor = saccade.Processor("n1.5", "tokenizer.json")
-            >>> processor.texts(processor.tokens("push the puck"))
-            ['push', ' the', ' ', 'pu', 'ck']
         """
         given = int64("ids", ids)
         if given.ndim != 1:
@@ -265,18 +240,16 @@ class Processor:
         return self._processor.texts(given.tolist())
 
     def __repr__(self) -> str:
-        size = (
-            ""
-            if self.image_size is None
-            else f" image_size={self.image_size} tokens_per_view={self.tokens_per_view}"
-        )
+        view = self._processor.view_size
+        size = "" if view is None else f" image_size={view[0]} tokens_per_view={view[1]}"
         return (
             f"<saccade.Processor version={self.version} preprocessing={self.preprocessing}{size} "
             f"tokens={self._processor.num_tokens}>"
         )
 
 
-_text = text  # in a method with an argument of that name
+def _optional(name: str, value: Any) -> str | None:
+    return None if value is None else checked_text(name, value)
 
 
 def _to_json(options: Any) -> str:
@@ -318,7 +291,10 @@ def _views(frames: Any, names: list[str] | None) -> list[_View]:
     if isinstance(frames, Mapping):
         if names is not None:
             raise InputError("view_names: expected none, since the frames have names")
-        return [(text("frames", name), frame(f"frames[{name!r}]", image)) for name, image in frames.items()]
+        return [
+            (checked_text("frames", name), frame(f"frames[{name!r}]", image))
+            for name, image in frames.items()
+        ]
     is_array = getattr(frames, "ndim", None) == 4
     if not is_array and not isinstance(frames, (list, tuple)):
         raise InputError(

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, ClassVar, Generic, Protocol, TypeVar
 
-from saccade._internal.hub import Location, locate, locate_published
+from saccade._internal.hub import Location, locate_published
 from saccade.errors import DtypeError
 
 
@@ -56,16 +56,7 @@ class Loaded(Generic[EngineT, ConfigT]):
         self._options = {} if options is None else dict(options)
 
     @classmethod
-    def _load(
-        cls: type[LoadedT],
-        id_or_path: str | os.PathLike[str],
-        revision: str | None,
-        options: Mapping[str, Any],
-    ) -> LoadedT:
-        return cls._load_from(locate(id_or_path, revision, files=cls._files), options)
-
-    @classmethod
-    def _load_from(cls: type[LoadedT], location: Location, options: Mapping[str, Any]) -> LoadedT:
+    def _load(cls: type[LoadedT], location: Location, options: Mapping[str, Any]) -> LoadedT:
         engine = cls._engine_class.load(os.fspath(location.path), *options.values())
         return cls(engine, location, options)
 
@@ -108,4 +99,4 @@ class Loaded(Generic[EngineT, ConfigT]):
 def _load_again(cls: type[LoadedT], place: str, commit: str | None, options: Mapping[str, Any]) -> LoadedT:
     """Unpickles a model by loading its checkpoint again: a path, or an id with its commit."""
     found = Location(Path(place)) if commit is None else locate_published(place, commit, files=cls._files)
-    return cls._load_from(found, options)
+    return cls._load(found, options)

@@ -8,6 +8,7 @@ from typing import Any
 
 import saccade._saccade as _saccade
 from saccade._internal.arrays import ArrayLike, as_stored, check_precision, mask_bytes
+from saccade._internal.hub import locate
 from saccade._internal.hub_files import BACKBONE
 from saccade._internal.loaded import Loaded
 from saccade.backbone.config import BackboneConfig
@@ -56,9 +57,7 @@ class Backbone(Loaded[_saccade.Backbone, BackboneConfig]):
         ``embed_tokens``, and layers of the language model from ``select_layer`` on are not read.
 
         Args:
-            id_or_path: A path or the id of a published checkpoint, as for
-                :meth:`saccade.ActionHead.from_pretrained`.
-            revision: A branch, tag or commit of the id. Default: ``main``.
+            id_or_path, revision, num_threads: As for :meth:`saccade.ActionHead.from_pretrained`.
             config: A dict or the path of a JSON file: the config of a whole checkpoint, whose
                 ``backbone_cfg.eagle_config`` may contain sizes, or that of a backbone alone
                 (``vision_config``, ``text_config``, ``eagle``, ``select_layer``, ``project_to_dim``). Sizes
@@ -67,15 +66,10 @@ class Backbone(Loaded[_saccade.Backbone, BackboneConfig]):
             precision: ``"float32"``, ``"bfloat16"`` or ``"int8"``, as for
                 :meth:`saccade.ActionHead.from_pretrained`. The table of embeddings is kept in bfloat16, or in
                 float32 if it is stored so and the precision is float32.
-            num_threads: Number of threads that a call uses. Default: the environment variable
-                ``SACCADE_NUM_THREADS``, else the number of physical cores that the process may use.
 
         Raises:
-            FileNotFoundError: ``id_or_path`` or the config does not exist, or cannot be downloaded.
-            PermissionError: The Hub denies access to the id.
-            CheckpointError: The config or the weights are damaged or do not fit each other, or there is no
-                backbone. The message lists every problem.
-            InputError: An option is out of range.
+            FileNotFoundError, PermissionError, CheckpointError, InputError: As
+                :meth:`saccade.ActionHead.from_pretrained`, or there is no backbone.
         """
         check_precision(precision)
         options = {  # in the order of the engine's arguments
@@ -83,7 +77,7 @@ class Backbone(Loaded[_saccade.Backbone, BackboneConfig]):
             "precision": precision,
             "num_threads": optional_integer("num_threads", num_threads),
         }
-        return cls._load(id_or_path, revision, options)
+        return cls._load(locate(id_or_path, revision, files=BACKBONE), options)
 
     @classmethod
     def from_tensors(
@@ -96,9 +90,8 @@ class Backbone(Loaded[_saccade.Backbone, BackboneConfig]):
     ) -> Backbone:
         """Creates a backbone from tensors in memory.
 
-        The result has the bits of :meth:`from_pretrained` for a file with these tensors. The
-        backbone keeps no reference to the tensors. A tensor that is not C-contiguous is copied first. Such a
-        backbone cannot be pickled, because it has no file to be loaded from.
+        As :meth:`saccade.ActionHead.from_tensors`: the bits are those of a file with these tensors, no
+        reference to them is kept, and the backbone cannot be pickled.
 
         Args:
             tensors: The tensors by their names in a checkpoint, with or without the prefix, as NumPy arrays
@@ -107,18 +100,13 @@ class Backbone(Loaded[_saccade.Backbone, BackboneConfig]):
             precision, num_threads: As for :meth:`from_pretrained`.
 
         Raises:
-            DtypeError: A tensor has another dtype, or is not on the CPU.
-            ShapeError: Shapes do not fit the config.
-            CheckpointError: Tensors are missing or unknown, or the config is damaged. This message and those
-                of the two errors above list every problem.
-            FileNotFoundError: The config does not exist.
-            InputError: An option is out of range, or a name is not valid Unicode.
+            DtypeError, ShapeError, CheckpointError, FileNotFoundError, InputError: As
+                :meth:`saccade.ActionHead.from_tensors`.
         """
         check_precision(precision)
-        config_text = None if config is None else to_json(config)
+        held_config = None if config is None else to_json(config)
         threads = optional_integer("num_threads", num_threads)
-        held = as_stored(tensors)
-        return cls(_saccade.Backbone.from_tensors(held, config_text, precision, threads))
+        return cls(_saccade.Backbone.from_tensors(as_stored(tensors), held_config, precision, threads))
 
     @property
     def config(self) -> BackboneConfig:

@@ -52,9 +52,8 @@ class BackboneFeatures(Handle):
     """The features of observations. Returned by :class:`saccade.Backbone`.
 
     It also contains what a later call can reuse (``previous``): the pixels and tokens of each view, and the
-    keys and values of every layer. It is immutable: any number of calls and threads may
-    use it at the same time. ``copy.copy`` and ``copy.deepcopy`` return the object itself. It cannot be
-    pickled.
+    keys and values of every layer. It is immutable: any number of calls and threads may use it at the same
+    time. ``copy.copy`` and ``copy.deepcopy`` return the object itself. It cannot be pickled.
     """
 
     _not_pickled = (
@@ -134,35 +133,32 @@ def made(
     image_token_id: int,
 ) -> BackboneFeatures:
     """The features of ``inputs`` from the result of the engine."""
-    use_torch = inputs._is_torch
-    arrays = (
-        like_features(held.features(), use_torch),
-        like_features(inputs.attention_mask.copy(), use_torch),
-        like_features(inputs.input_ids == image_token_id, use_torch),
-    )
+
+    def shown(array: npt.NDArray[Any]) -> Array:
+        return like_features(array, inputs._is_torch)
+
+    features, is_image = shown(held.features()), shown(inputs.input_ids == image_token_id)
     places = held.views()
     names = view_names(inputs.view_names, max(map(len, places), default=0))
     views = {}
     for index, name in enumerate(names):
         rows = [row[index] if index < len(row) else np.empty(0, np.int64) for row in places]
-        table = np.full((len(rows), max(map(len, rows))), -1, np.int64)
-        for to, row in zip(table, rows, strict=True):
+        views[name] = np.full((len(rows), max(map(len, rows))), -1, np.int64)
+        for to, row in zip(views[name], rows, strict=True):
             to[: len(row)] = row
-        views[name] = table
     record = None
     if recorded is not None:
-        hidden, vision, tokens = recorded
-
-        def by_view(rows: list[list[npt.NDArray[np.float32]]]) -> dict[tuple[int, str], Array]:
-            return {
-                (row, names[index]): like_features(array, use_torch)
-                for row, arrays in enumerate(rows)
-                for index, array in enumerate(arrays)
+        hidden, *of_views = recorded
+        by_view = [
+            {
+                (row, names[index]): shown(view)
+                for row, found in enumerate(rows)
+                for index, view in enumerate(found)
             }
-
-        layers = {layer: like_features(array, use_torch) for layer, array in enumerate(hidden)}
-        record = BackboneRecord(layers, by_view(vision), by_view(tokens))
-    return BackboneFeatures(held, arrays, views, record)
+            for rows in of_views
+        ]
+        record = BackboneRecord({layer: shown(rows) for layer, rows in enumerate(hidden)}, *by_view)
+    return BackboneFeatures(held, (features, shown(inputs.attention_mask.copy()), is_image), views, record)
 
 
 def view_names(given: tuple[str, ...] | None, count: int) -> tuple[str, ...]:

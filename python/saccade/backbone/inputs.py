@@ -16,7 +16,8 @@ class BackboneInputs:
     """The inputs of a backbone, in the shapes of the released code. They always have a batch axis.
 
     :class:`saccade.Processor` makes them from camera frames and an instruction. NumPy arrays and torch CPU
-    tensors are both taken.
+    tensors are both taken, and kept under the names of the arguments: arrays as float32, int64 and bool,
+    sequences as tuples.
 
     Args:
         pixel_values: The normalised pixels of all views, those of the first observation first. N1.5:
@@ -28,13 +29,6 @@ class BackboneInputs:
             width.
         view_names: The names of the views of an observation, in the order of the prompt. Default:
             ``"view_1"``, ``"view_2"``, and so on.
-
-    Attributes:
-        pixel_values: float32: an array, or for N1.6 a tuple of them.
-        input_ids: int64.
-        attention_mask: bool.
-        image_grid_thw: int64, or None.
-        view_names: A tuple of names, or None.
 
     Raises:
         ShapeError: An array has another shape.
@@ -64,12 +58,11 @@ class BackboneInputs:
         view_names: Sequence[str] | None = None,
     ) -> None:
         if isinstance(pixel_values, (list, tuple)) and all(hasattr(view, "shape") for view in pixel_values):
-            views = tuple(
-                _with_axes(f"pixel_values[{index}]", float32(f"pixel_values[{index}]", view), 4)
+            self.pixel_values = tuple(
+                _with_axes(name := f"pixel_values[{index}]", float32(name, view), 4)
                 for index, view in enumerate(pixel_values)
             )
             self._is_torch = any(map(is_torch, pixel_values))
-            self.pixel_values = views
         else:
             self._is_torch = is_torch(pixel_values)
             self.pixel_values = float32("pixel_values", cast("ArrayLike", pixel_values))

@@ -126,8 +126,7 @@ class HeadConfig:
         """Reads a ``config.json`` file; see :meth:`from_dict`.
 
         Raises:
-            FileNotFoundError: The file does not exist.
-            CheckpointError: As :meth:`from_dict`.
+            FileNotFoundError, CheckpointError: The file does not exist; or as :meth:`from_dict`.
         """
         return cls(**_saccade.parse_config(read_text(path)))
 

@@ -61,8 +61,8 @@ class CrossAttention(Handle):
     """Multi-head cross-attention with its projections: ``to_out(softmax(q k^T / sqrt(head_dim)) v)``.
 
     Attention heads are contiguous slices of the width, as in the released head (``Attention`` of diffusers).
-    An instance is immutable and may be called by any number of threads at the same time. ``copy.copy`` and
-    ``copy.deepcopy`` return the instance itself. It cannot be pickled.
+    Immutable: any number of threads may call it at the same time. ``copy.copy`` and ``copy.deepcopy`` return
+    the object itself. It cannot be pickled.
 
     Args:
         tensors: ``to_q.weight (width, width)``, ``to_k.weight`` and ``to_v.weight (width, context_dim)``,
@@ -101,10 +101,7 @@ class CrossAttention(Handle):
         if not isinstance(tensors, Mapping):
             raise DtypeError(f"tensors: expected a mapping of names to arrays, got {type(tensors).__name__}")
         check_precision(precision)
-        arrays = {
-            text("tensors", str(name)): float32(f"tensors[{name!r}]", value)
-            for name, value in tensors.items()
-        }
+        arrays = {text("tensors", str(key)): float32(f"tensors[{key!r}]", tensors[key]) for key in tensors}
         for name, array in arrays.items():
             if not np.isfinite(array).all():
                 raise InputError(f"tensors[{name!r}]: expected finite values")
@@ -142,8 +139,7 @@ class CrossAttention(Handle):
             encoder_hidden_states: ``(batch, T_vl, context_dim)``, floating point.
 
         Raises:
-            ShapeError, DtypeError, InputError: The tokens have the wrong shape or dtype, or are not finite.
-            MemoryError: There is not enough memory.
+            ShapeError, DtypeError, InputError, MemoryError: As a call.
         """
         held = self._attention.project(float32("encoder_hidden_states", encoder_hidden_states))
         return KeyValues(held, is_torch(encoder_hidden_states))
@@ -189,8 +185,8 @@ class CrossAttention(Handle):
                 of a query is zero and its output is the bias of ``to_out``.
             key_bias: ``(batch, T_vl)``, added to the logits. Minus infinity removes a key.
             return_weights: Whether to return the attention probabilities as well.
-            out: The array that the result is written to: writable float32, C-contiguous, ``(batch, queries,
-                width)``. It is also returned.
+            out: The array that the result is written to and that is returned, as in
+                :meth:`saccade.ActionHead.sample`.
 
         Returns:
             ``(batch, queries, width)`` float32; a torch tensor if the tokens of ``kv`` were torch. With

@@ -50,8 +50,7 @@ class ActionHead(LoadedHead):
         The head of the bundled demo policy, on the features of two observations:
 
         >>> import numpy as np, saccade
-        >>> demo = saccade.demo_checkpoint()
-        >>> head = saccade.ActionHead.from_pretrained(demo)
+        >>> head = saccade.ActionHead.from_pretrained(saccade.demo_checkpoint())
         >>> context = head.encode(np.zeros((2, 60, head.config.context_dim), np.float32))
         >>> state = np.zeros((2, head.config.state_dim), np.float32)
         >>> actions = head.sample(context, state, embodiment_id=0, seed=7)
@@ -81,10 +80,9 @@ class ActionHead(LoadedHead):
 
         Args:
             backbone_features: ``(batch, T_vl, context_dim)``.
-            attention_mask: bool ``(batch, T_vl)``, True where a position is attended. Default: everywhere. It
-                applies to the cross-attention blocks of heads with ``config.mask_mode == "alternate"`` (GR00T
-                N1.6 and N1.7), and not to the VL self-attention. The released N1 and N1.5 ignore padding, so
-                these heads accept an all-true mask only.
+            attention_mask: bool ``(batch, T_vl)``, True where a position is attended; everywhere by default.
+                It applies to the cross-attention blocks of heads with ``config.mask_mode == "alternate"``
+                (N1.6, N1.7), not to the VL self-attention. N1 and N1.5 accept an all-true mask only.
             image_mask: bool ``(batch, T_vl)``, True for image tokens. The context keeps it for attention
                 maps. Required with ``mask_mode == "alternate"``, where some blocks attend to text only and
                 others to images only. Each observation must then contain an attended token of each kind.
@@ -108,8 +106,8 @@ class ActionHead(LoadedHead):
             attention,
             hidden,
         )
-        kept = [_converted(arrays, use_torch) for arrays in recorded]
-        return Context(held, use_torch, Record(*kept) if attention or hidden else None)
+        kept = Record(*(_converted(arrays, use_torch) for arrays in recorded))
+        return Context(held, use_torch, kept if attention or hidden else None)
 
     def sample(
         self,
@@ -145,23 +143,19 @@ class ActionHead(LoadedHead):
                 2 v(x, t), t + dt / 2)``, which evaluates the velocity twice in each step.
             num_samples: Number of chunks for each observation. With None, noise and result have no axis for
                 it. With any integer, 1 included, they have one.
-            future_refresh: The state rows and the future rows are recomputed every ``future_refresh``
-                velocity evaluations: at evaluations 0, r, 2 r, ... (for Euler, an evaluation is a step). At
-                the others only the action rows are computed, and self-attention uses the latest keys and
-                values of the other rows. None and 1 are exact and give the same bits. From 2 on, sampling is
-                faster and approximate. If r is not less than the number of evaluations, these rows are
-                computed once.
+            future_refresh: The state rows and the future rows are recomputed at velocity evaluations 0, r, 2
+                r, ... only (for Euler, an evaluation is a step). In between, self-attention uses their latest
+                keys and values. None and 1 are exact and give the same bits. From 2 on, sampling is faster
+                and approximate. A larger r than there are evaluations computes them once.
             intervention: One or several :class:`saccade.Intervention`, which act together. With
                 ``future_refresh``, cuts and biases act on the rows that are computed. A patch of state or
                 future rows at a step where they are not always computed is an error. All evaluations of a
                 step belong to that step.
-            previous_chunk: The previous chunk, ``(batch, rows, action_dim)`` as the head returned it (or
-                ``encoder_action_dim`` wide), with ``chunking.horizon`` to ``action_horizon`` rows. All
-                samples of an observation continue the same chunk.
-            chunking: How the chunk continues the previous one, see :class:`saccade.Chunking`. Required with
-                ``previous_chunk``, and only then.
-            out: The array that the result is written to: writable float32, C-contiguous, of the shape of the
-                result. It is also returned.
+            previous_chunk: ``(batch, rows, action_dim)`` as the head returned it (or ``encoder_action_dim``
+                wide), with ``chunking.horizon`` to ``action_horizon`` rows. All samples continue this chunk.
+            chunking: How the chunk continues the previous one. Required with ``previous_chunk`` only.
+            out: The array that the result is written to and that is returned: writable, float32,
+                C-contiguous, of the shape of the result.
 
         Returns:
             ``(batch, action_horizon, action_dim)``, or ``(batch, num_samples, action_horizon, action_dim)``.
@@ -259,8 +253,7 @@ class ActionHead(LoadedHead):
             ``(batch, action_horizon, action_dim)`` float32; a torch tensor if the features were torch.
 
         Raises:
-            ShapeError, DtypeError, InputError: An argument does not fit the head or is not finite.
-            MemoryError: There is not enough memory.
+            ShapeError, DtypeError, InputError, MemoryError: As :meth:`sample`.
         """
         held = _held(context)
         output = result((held.batch, self.config.action_horizon, self.config.action_dim), None)
@@ -290,7 +283,7 @@ class ActionHead(LoadedHead):
         steps: int | Sequence[int] | None = None,
         max_bytes: int = 2**31,
     ) -> Trace[Array]:
-        """Samples as :meth:`sample` does, and records attention probabilities and hidden states.
+        """Samples as :meth:`sample` does, and records what :class:`saccade.Trace` lists and shows.
 
         All rows are computed in every block at every step, whereas ``sample`` computes only the action rows
         of the last block. There is no ``future_refresh``, and steps are Euler steps.
@@ -304,26 +297,11 @@ class ActionHead(LoadedHead):
             max_bytes: A larger trace is refused before anything is allocated.
 
         Returns:
-            The attention ``(batch, heads, queries, keys)`` and the rows ``(batch, rows, width)`` by ``(step,
-            block)``, and the actions, bit for bit those of ``sample``. float32; torch tensors if the features
-            were torch.
+            The attention, the rows, and the actions, bit for bit those of ``sample``.
 
         Raises:
-            ShapeError, DtypeError, InputError: An argument does not fit the head or is not finite, both
-                ``noise`` and ``seed`` are given, or the trace exceeds ``max_bytes``.
-            MemoryError: There is not enough memory.
-
-        Example:
-            What the future rows attend to in the first block, averaged over attention heads:
-
-                >>> import numpy as np, saccade
-            >>> head = saccade.ActionHead.from_pretrained(saccade.demo_checkpoint())
-            >>> context = head.encode(np.zeros((1, 60, head.config.context_dim), np.float32))
-            >>> state = np.zeros((1, head.config.state_dim), np.float32)
-            >>> trace = head.trace(context, state, 0, seed=7, blocks=0, steps=0)
-            >>> attended = trace.attention[0, 0][:, :, trace.rows["future"]].mean(axis=1)
-            >>> attended.shape == (1, head.config.num_future_tokens, context.num_vl_tokens)
-            True
+            ShapeError, DtypeError, InputError, MemoryError: As :meth:`sample`, or the trace exceeds
+                ``max_bytes``.
         """
         held = _held(context)
         config = self.config

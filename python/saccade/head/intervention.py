@@ -72,8 +72,7 @@ class Intervention:
     Example:
         The vision-language tokens reach the actions only through the future tokens:
 
-        >>> through_future = Intervention(cut=[("action", "vl"), ("state", "vl")])
-        >>> through_future.cut
+        >>> Intervention(cut=[("action", "vl"), ("state", "vl")]).cut
         ((('action', None), ('vl', None)), (('state', None), ('vl', None)))
 
         The actions do not attend to the first two future tokens in block 1:
@@ -91,18 +90,9 @@ class Intervention:
     heads: Sequence[int] | int | None = None
 
     def __post_init__(self) -> None:
-        def keep(name: str, value: Any) -> None:
-            object.__setattr__(self, name, value)
-
-        keep("cut", _cuts(self.cut))
-        keep("key_bias", _biases(self.key_bias))
-        keep("patch", _patches(self.patch))
-        keep("future_tokens", _future_tokens(self.future_tokens))
-        for name in ("blocks", "steps", "heads"):
-            chosen = indices(name, getattr(self, name))
-            if chosen == ():
-                raise InputError(f"{name}: expected at least one, or None for all, got none")
-            keep(name, chosen)
+        checks = {"cut": _cuts, "key_bias": _biases, "patch": _patches, "future_tokens": _future_tokens}
+        for name, value in vars(self).items():
+            object.__setattr__(self, name, checks[name](value) if name in checks else _some(name, value))
 
 
 def as_interventions(given: Intervention | Sequence[Intervention] | None) -> tuple[Intervention, ...]:
@@ -121,6 +111,13 @@ def as_interventions(given: Intervention | Sequence[Intervention] | None) -> tup
         if not isinstance(one, Intervention):
             raise InputError(f"{expected}, got a sequence with {type(one).__name__}")
     return tuple(several)
+
+
+def _some(name: str, value: Any) -> tuple[int, ...] | None:
+    chosen = indices(name, value)
+    if chosen == ():
+        raise InputError(f"{name}: expected at least one, or None for all, got none")
+    return chosen
 
 
 def _cuts(cut: Any) -> tuple[tuple[Chosen, Chosen], ...]:
@@ -193,10 +190,9 @@ def _patches(patch: Any) -> dict[tuple[int, int], dict[Chosen, Float32Array]] | 
         for tokens, rows in groups.items():
             name = f"patch[{key}][{tokens!r}]"
             chosen = _chosen(name, tokens)
-            if chosen[0] == "vl":
-                raise InputError(
-                    f"{name}: expected state, future or action, got 'vl', which blocks do not change"
-                )
+            if chosen[0] not in ROW_GROUPS:
+                expected = "expected state, future or action, got 'vl', which blocks do not change"
+                raise InputError(f"{name}: {expected}")
             values = float32(name, rows)
             if values.ndim not in (2, 3):
                 raise ShapeError(

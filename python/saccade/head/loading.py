@@ -15,6 +15,7 @@ from saccade._internal.arrays import (
     integer,
     optional_integers,
 )
+from saccade._internal.hub import locate
 from saccade._internal.hub_files import HEAD
 from saccade._internal.loaded import Loaded
 from saccade.head.config import HeadConfig, to_json
@@ -60,11 +61,11 @@ class LoadedHead(Loaded[_saccade.ActionHead, HeadConfig]):
                 Default: the ``config.json`` in the directory of the weights. A config that lerobot wrote does
                 not contain the sizes of the head, so they are read from the shapes of the tensors.
             embodiment_ids: Load the layers of these embodiments only. Ids keep their numbers. Default: all.
-            action_horizon: Number of actions that the head denoises, in place of the config's
-                ``action_horizon``. At most ``max_positions`` if the head adds positions to the actions. For
-                fine-tunes whose config gives another number than they were trained with. Default: that of the
-                config. The ``config.json`` of a lerobot policy has none, so it is that of the published model
-                that lerobot starts from: 16 for N1.5, 40 for N1.7, whatever ``chunk_size`` is.
+            action_horizon: Number of actions that the head denoises, for fine-tunes whose config gives
+                another number than they were trained with. At most ``max_positions`` if the head adds
+                positions to the actions. Default: that of the config. The ``config.json`` of a lerobot policy
+                has none, so it is that of the published model that lerobot starts from: 16 for N1.5, 40 for
+                N1.7, whatever ``chunk_size`` is.
             num_states: Number of states in an observation, for models that were trained with several
                 (``observation_indices`` of the data config of N1 and N1.5, ``delta_indices`` of the states
                 of N1.6). Each has a state row of its own. Default: 1. N1.7 makes one row of
@@ -72,14 +73,12 @@ class LoadedHead(Loaded[_saccade.ActionHead, HeadConfig]):
             precision: How the head computes. The residual stream, norms, softmax and all sums of floating
                 point products are float32 at every precision.
 
-                - ``"float32"``: exact up to rounding. Weights stored as bfloat16 stay bfloat16 in memory,
-                  which loses nothing.
-                - ``"bfloat16"``: weights, inputs of linear layers, keys and values are rounded to bfloat16,
-                  which keeps 8 bits. Takes half the memory of float32 weights, and is faster on a CPU with a
-                  bfloat16 dot product.
+                - ``"float32"``: exact up to rounding. Weights stored as bfloat16 stay so, without loss.
+                - ``"bfloat16"``: weights, inputs of linear layers, keys and values are rounded to bfloat16.
+                  Half the memory of float32, and faster on a CPU with a bfloat16 dot product.
                 - ``"int8"``: the attention and feed-forward layers of all blocks multiply 8-bit integers,
-                  with a scale for each output of the weights and one for each row of the inputs. Takes a
-                  quarter of the memory, and is the fastest. Everything else is as in ``"bfloat16"``.
+                  with a scale for each output of the weights and one for each row of the inputs. A quarter of
+                  the memory, and the fastest. Everything else is as in ``"bfloat16"``.
 
                 ``docs/precision.md`` has the measured accuracy of each.
             num_threads: Number of threads that a call uses. Default: the environment variable
@@ -102,7 +101,7 @@ class LoadedHead(Loaded[_saccade.ActionHead, HeadConfig]):
             "precision": precision,
             "num_threads": optional_integer("num_threads", num_threads),
         }
-        return cls._load(id_or_path, revision, options)
+        return cls._load(locate(id_or_path, revision, files=HEAD), options)
 
     @classmethod
     def from_tensors(
@@ -117,10 +116,10 @@ class LoadedHead(Loaded[_saccade.ActionHead, HeadConfig]):
     ) -> HeadT:
         """Creates a head from tensors in memory.
 
-        The result has the bits of :meth:`from_pretrained` for a file with these tensors. The head
-        keeps no reference to the tensors. They are packed one at a time, and only the layers of the requested
-        embodiments are read. A tensor that is not C-contiguous is copied first. Such a head cannot be
-        pickled, because it has no file to be loaded from.
+        The result has the bits of :meth:`from_pretrained` for a file with these tensors, and keeps no
+        reference to them. They are packed one at a time, and only the layers of the requested embodiments are
+        read. A tensor that is not C-contiguous is copied first. Such a head cannot be pickled, because it has
+        no file to be loaded from.
 
         Args:
             tensors: The tensors of the head by their names in a checkpoint, without prefix (the state dict of
@@ -128,8 +127,7 @@ class LoadedHead(Loaded[_saccade.ActionHead, HeadConfig]):
                 is widened to float32, which is exact. All tensors that the config asks for must be present.
                 Others are refused, except those that only training uses (``task_log_sigma.*``,
                 ``mask_token``) and ``dropout_prob_by_embodiment`` (see the class).
-            config: The config of the head or of a whole checkpoint, as for :meth:`from_pretrained`.
-            embodiment_ids, num_states, precision, num_threads: As for :meth:`from_pretrained`.
+            config, embodiment_ids, num_states, precision, num_threads: As for :meth:`from_pretrained`.
 
         Raises:
             DtypeError: A tensor has another dtype, or is not on the CPU.
@@ -159,8 +157,7 @@ class LoadedHead(Loaded[_saccade.ActionHead, HeadConfig]):
     def future_tokens(self) -> Float32Array:
         """A copy of the learned future tokens, ``(num_future_tokens, width)`` float32.
 
-        They are as they enter the first block. To replace them in a call, pass other tokens to
-        :class:`saccade.Intervention` as ``future_tokens``.
+        They are as they enter the first block. :class:`saccade.Intervention` can replace them in a call.
         """
         return self._engine.future_tokens()
 
@@ -185,8 +182,7 @@ class LoadedHead(Loaded[_saccade.ActionHead, HeadConfig]):
         Args:
             num_vl_tokens: T_vl of the calls.
             batch: Number of observations of the calls.
-            num_samples: ``num_samples`` of the calls.
-            future_refresh: ``future_refresh`` of the calls.
+            num_samples, future_refresh: As the calls give them to :meth:`saccade.ActionHead.sample`.
 
         Raises:
             InputError: A size is not an integer of at least 1.

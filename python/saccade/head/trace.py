@@ -35,12 +35,18 @@ class Trace(Generic[ArrayT]):
         >>> import numpy as np, saccade
         >>> head = saccade.ActionHead.from_pretrained(saccade.demo_checkpoint())
         >>> context = head.encode(np.zeros((1, 60, head.config.context_dim), np.float32))
-        >>> head.trace(context, np.zeros((1, head.config.state_dim)), 0, seed=7, blocks=[0, 2])
+        >>> trace = head.trace(context, np.zeros((1, head.config.state_dim)), 0, seed=7, blocks=[0, 2])
+        >>> trace
         <saccade.Trace 0.4 MB
           attention[step, block]: steps 0-3, blocks 0, 2: (1, 4, 49, 60)
           hidden: not recorded
           rows: state 0, future 1-32, action 33-48
           actions: (1, 16, 4)>
+
+        What the future rows attend to in the first block, averaged over attention heads:
+
+        >>> trace.attention[0, 0][:, :, trace.rows["future"]].mean(axis=1).shape
+        (1, 32, 60)
     """
 
     attention: Mapping[tuple[int, int], ArrayT]
@@ -50,17 +56,9 @@ class Trace(Generic[ArrayT]):
 
     def __repr__(self) -> str:
         nbytes = _nbytes(self.attention, self.hidden) + getattr(self.actions, "nbytes", 0)
-        rows = ", ".join(
-            f"{group} {_span(range(*span.indices(span.stop)))}" for group, span in self.rows.items()
-        )
-        lines = [
-            f"<saccade.Trace {_size(nbytes)}",
-            *_listed("attention", self.attention),
-            *_listed("hidden", self.hidden),
-            f"  rows: {rows}",
-            f"  actions: {_shape(self.actions)}>",
-        ]
-        return "\n".join(lines)
+        spans = {group: _span(range(*span.indices(span.stop))) for group, span in self.rows.items()}
+        rows = ", ".join(f"{group} {span}" for group, span in spans.items())
+        return f"{_listed(self, nbytes)}\n  rows: {rows}\n  actions: {tuple(self.actions.shape)}>"  # type: ignore[attr-defined]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -85,12 +83,7 @@ class Record:
         return _nbytes(self.attention, self.hidden)
 
     def __repr__(self) -> str:
-        lines = [
-            f"<saccade.Record {_size(self.nbytes)}",
-            *_listed("attention", self.attention),
-            *_listed("hidden", self.hidden),
-        ]
-        return "\n".join(lines) + ">"
+        return f"{_listed(self, self.nbytes)}>"
 
 
 def check_record(record: Any, known: tuple[str, ...] = RECORDS) -> list[bool]:
@@ -112,38 +105,30 @@ def _nbytes(*recorded: Mapping[Any, Any]) -> int:
     return sum(int(array.nbytes) for arrays in recorded for array in arrays.values())
 
 
-def _listed(name: str, arrays: Mapping[Any, Any]) -> list[str]:
+def _listed(record: Any, nbytes: int) -> str:
     """The keys and shapes of recorded arrays: a line for each shape."""
-    if not arrays:
-        return [f"  {name}: not recorded"]
-    by_shape: dict[str, list[Any]] = {}
-    for place, array in arrays.items():
-        by_shape.setdefault(_shape(array), []).append(place)
-    lines = []
-    for shape, places in by_shape.items():
-        if isinstance(places[0], tuple):
-            steps, blocks = ([place[axis] for place in places] for axis in (0, 1))
-            lines.append(f"  {name}[step, block]: steps {_span(steps)}, blocks {_span(blocks)}: {shape}")
-        else:
-            lines.append(f"  {name}[block]: blocks {_span(places)}: {shape}")
-    return lines
+    lines = [f"<saccade.{type(record).__name__} {nbytes / 1e6:,.1f} MB"]
+    for name in RECORDS:
+        by_shape: dict[tuple[int, ...], list[Any]] = {}
+        for place, array in getattr(record, name).items():
+            by_shape.setdefault(tuple(array.shape), []).append(place)
+        for shape, places in by_shape.items():
+            if isinstance(places[0], tuple):
+                steps, blocks = map(_span, zip(*places, strict=True))
+                lines.append(f"  {name}[step, block]: steps {steps}, blocks {blocks}: {shape}")
+            else:
+                lines.append(f"  {name}[block]: blocks {_span(places)}: {shape}")
+        if not by_shape:
+            lines.append(f"  {name}: not recorded")
+    return "\n".join(lines)
 
 
 def _span(indices: Any) -> str:
     """Indices with runs of neighbours shortened, such as ``"0-3, 6"``."""
-    ordered = sorted(set(indices))
     runs: list[list[int]] = []
-    for index in ordered:
+    for index in sorted(set(indices)):
         if runs and index == runs[-1][-1] + 1:
             runs[-1].append(index)
         else:
             runs.append([index])
     return ", ".join(str(run[0]) if len(run) == 1 else f"{run[0]}-{run[-1]}" for run in runs) or "none"
-
-
-def _shape(array: Any) -> str:
-    return str(tuple(array.shape))
-
-
-def _size(nbytes: int) -> str:
-    return f"{nbytes / 1e6:,.1f} MB"
