@@ -12,11 +12,11 @@ import saccade
 from saccade.backbone.features import BackboneFeatures
 from saccade.backbone.inputs import BackboneInputs
 from saccade.errors import InputError
-from saccade.head.inputs import HeadInputs
 from saccade.observations import read
 from saccade.policy.encoding import PolicyContext, compute_features, encode_features
 from saccade.policy.preparing import prepare_inputs
 from saccade.policy.reading import Observations, read_observations
+from saccade_lab.head_inputs import HeadInputs
 
 
 @dataclass(frozen=True, eq=False)

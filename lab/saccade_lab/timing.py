@@ -14,8 +14,8 @@ import saccade._saccade as _saccade
 from saccade.head.config import HeadConfig
 from saccade.head.context import Context
 from saccade.head.head import ActionHead
-from saccade.head.inputs import HeadInputs
 from saccade.head.intervention import Intervention
+from saccade_lab.head_inputs import HeadInputs
 
 #: The timed calls: encoding an observation, sampling a chunk from its context, and both.
 WORKS = ("encode", "sample", "both")

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 import saccade
-from saccade.head.inputs import HeadInputs
+from saccade_lab.head_inputs import HeadInputs
 from saccade_lab.maps.layout import parse_layout
 from saccade_lab.maps.occlusion import DroppedPositions, Occlusion
 from saccade_lab.maps.record import Maps, Selection

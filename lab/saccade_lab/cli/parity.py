@@ -21,9 +21,9 @@ from saccade._internal.environment import cpu_name
 from saccade._internal.flags import UsageError
 from saccade._internal.hub import resolve
 from saccade.cli import output
-from saccade.head.inputs import HeadInputs
 from saccade_lab import flags as lab_flags
 from saccade_lab.extras import LAB, require
+from saccade_lab.head_inputs import HeadInputs
 
 if TYPE_CHECKING:
     from typing import TypeAlias

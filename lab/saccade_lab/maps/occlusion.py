@@ -15,10 +15,10 @@ import numpy as np
 from saccade._internal.arrays import Float32Array, UInt8Array
 from saccade.errors import InputError
 from saccade.head.head import ActionHead
-from saccade.head.inputs import HeadInputs
 from saccade.observations import view_places
 from saccade.policy.encoding import PolicyContext
 from saccade.policy.policy import Policy
+from saccade_lab.head_inputs import HeadInputs
 from saccade_lab.maps.layout import Layout, ViewLayout
 
 MAX_CELLS = 8  # along each side of a picture by default; each costs a pass through the policy

@@ -15,9 +15,9 @@ from saccade._internal.arrays import UInt8Array
 from saccade.errors import InputError, ShapeError
 from saccade.head.config import HeadConfig
 from saccade.head.input_files import as_mask, read_arrays
-from saccade.head.inputs import HeadInputs
 from saccade.observations import read
 from saccade.policy.policy import Policy
+from saccade_lab.head_inputs import HeadInputs
 from saccade_lab.inside import context_of, features_of, head_inputs, inputs_of
 from saccade_lab.maps import layout as layouts
 from saccade_lab.maps.grid import layout_of

@@ -17,12 +17,12 @@ from saccade.backbone.inputs import BackboneInputs
 from saccade.errors import InputError
 from saccade.head.config import HeadConfig
 from saccade.head.head import ActionHead
-from saccade.head.inputs import HeadInputs
 from saccade.observations import read
 from saccade.observations.pictures import PictureObservation, read_frames
 from saccade.policy.encoding import pad_tokens
 from saccade.policy.policy import Policy
 from saccade_lab.files import checkpoint_identity
+from saccade_lab.head_inputs import HeadInputs
 from saccade_lab.inside import context_of, features_of, head_inputs, inputs_of, parts_of
 from saccade_lab.maps.grid import layout_of
 from saccade_lab.maps.layout import Layout

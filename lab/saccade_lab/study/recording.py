@@ -14,9 +14,9 @@ from saccade._internal.arrays import Float32Array
 from saccade._internal.files import sha256_of
 from saccade.head.config import HeadConfig
 from saccade.head.head import ActionHead
-from saccade.head.inputs import HeadInputs
 from saccade.head.intervention import Intervention
 from saccade_lab.files import checkpoint_identity
+from saccade_lab.head_inputs import HeadInputs
 from saccade_lab.study.source import Source, episode_rng
 
 NOISES = 4  # drawn for each observation that has none
@@ -159,7 +159,7 @@ class Recording(Recorded):
 
     @property
     def all(self) -> HeadInputs:
-        """All observations of the file, checked; raises as ``saccade.head.inputs.HeadInputs.from_file``."""
+        """All observations of the file, checked; raises as ``HeadInputs.from_file``."""
         return read(self.file, self.config)
 
 

@@ -16,10 +16,10 @@ from saccade.errors import CheckpointError
 from saccade.head.config import HeadConfig
 from saccade.head.head import ActionHead
 from saccade.head.input_files import BoolArray
-from saccade.head.inputs import HeadInputs
 from saccade.head.intervention import Intervention
 from saccade.policy.interfaces import Head
 from saccade_lab.files import path_text
+from saccade_lab.head_inputs import HeadInputs
 from saccade_lab.sim.environment import TaskEnvironment
 from saccade_lab.sim.policy import DEMO_CHECKPOINT, Policy, check_trained_on
 from saccade_lab.sim.rollout import Episode, environment_for, run_episode

@@ -13,8 +13,8 @@ import numpy as np
 from saccade._internal.arrays import Float32Array
 from saccade.head.config import HeadConfig
 from saccade.head.head import ActionHead
-from saccade.head.inputs import HeadInputs
 from saccade.head.intervention import Intervention
+from saccade_lab.head_inputs import HeadInputs
 
 
 class Source(ABC):

@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
-import dataclasses
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, TypeAlias
 
 import numpy as np
 
 from saccade._internal.arrays import Float32Array, integer
 from saccade.checkpoints.description import Config, Source, open_published
+from saccade.head.config import HeadConfig
 from saccade.head.head import ActionHead
-from saccade.head.input_files import read_arrays
-from saccade.head.inputs import HeadInputs
+from saccade.head.input_files import checked, read_arrays
 from saccade.head.intervention import Intervention
 from saccade.head.options import LoadOptions
+
+#: The arguments of a call of a head for one observation.
+_Inputs: TypeAlias = Mapping[str, Any]
 
 
 @dataclass(frozen=True)
@@ -89,15 +92,11 @@ def action_changes(
     loading: LoadOptions = {"embodiment_ids": ids, "num_threads": num_threads}
     head = ActionHead.from_pretrained(source, config=config, **loading)
     if arrays is None:
-        observations = [
-            HeadInputs.random(head.config, num_vl_tokens, rng, head.embodiment_ids[0])
-            for _ in range(num_observations)
-        ]
+        observations = [_random(head, num_vl_tokens, rng) for _ in range(num_observations)]
     else:
-        recorded = HeadInputs.from_arrays(arrays, head.config, str(features))
-        observations = list(recorded.with_noise(rng, head.config).rows())
+        observations = _rows(checked(arrays, head.config, str(features)), head.config, rng)
     before = _actions(head, observations)
-    others = [dataclasses.replace(one, noise=None).with_noise(rng, head.config) for one in observations]
+    others = [{**one, "noise": _noise(head.config, rng)} for one in observations]
     of_other_noise = change(before, _actions(head, others))
     del head
     head = ActionHead.from_pretrained(resized, **loading)
@@ -115,7 +114,32 @@ def action_changes(
     )
 
 
+def _random(head: ActionHead, num_vl_tokens: int, rng: np.random.Generator) -> _Inputs:
+    """Standard normal features, state and noise, drawn in this order."""
+    config = head.config
+    return {
+        "backbone_features": rng.standard_normal((1, num_vl_tokens, config.context_dim), np.float32),
+        "state": rng.standard_normal((1, config.num_states, config.state_dim), np.float32),
+        "embodiment_id": head.embodiment_ids[0],
+        "noise": _noise(config, rng),
+    }
+
+
+def _rows(recorded: _Inputs, config: HeadConfig, rng: np.random.Generator) -> list[_Inputs]:
+    """Each row of a batch, with noise if the batch has none."""
+    if recorded["noise"] is None:
+        recorded = {**recorded, "noise": np.concatenate([_noise(config, rng) for _ in recorded["state"]])}
+    given = {name: array for name, array in recorded.items() if array is not None}
+    return [
+        {name: array[row : row + 1] for name, array in given.items()} for row in range(len(given["state"]))
+    ]
+
+
+def _noise(config: HeadConfig, rng: np.random.Generator) -> Float32Array:
+    return rng.standard_normal((1, config.action_horizon, config.encoder_action_dim), np.float32)
+
+
 def _actions(
-    head: ActionHead, observations: Sequence[HeadInputs], intervention: Intervention | None = None
+    head: ActionHead, observations: Sequence[_Inputs], intervention: Intervention | None = None
 ) -> Float32Array:
-    return np.concatenate([one.sample(head, intervention=intervention) for one in observations])
+    return np.concatenate([np.asarray(head(**one, intervention=intervention)) for one in observations])

@@ -61,10 +61,12 @@ def run(args: argparse.Namespace) -> int:
     """Writes the copy and reports what it contains and how far actions move."""
     from saccade.checkpoints import describe, resize
     from saccade.checkpoints.comparison import action_changes
-    from saccade.head.inputs import HeadInputs
+    from saccade.head.input_files import checked, read_arrays
 
     if args.features is not None:  # refused before anything is written
-        HeadInputs.from_file(Path(args.features), describe(args.checkpoint, args.config).config)
+        features = Path(args.features)
+        config = describe(args.checkpoint, args.config).config
+        checked(read_arrays(features), config, str(features))
     sizes = {"num_future_tokens": args.num_future_tokens, "perturbation": args.perturbation}
     report = copy(resize, "resizing", args, seed=args.seed, **sizes)
     changes = action_changes(

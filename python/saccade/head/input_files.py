@@ -96,7 +96,7 @@ def _read_safetensors(path: Path) -> dict[str, npt.NDArray[Any]]:
 
 
 def checked(arrays: Mapping[str, npt.NDArray[Any]], config: HeadConfig, where: str) -> dict[str, Any]:
-    """The fields of :class:`saccade.head.inputs.HeadInputs` for the arrays of a file.
+    """The arguments of a call of a head, but for its options, from the arrays of a file; None where missing.
 
     Args:
         arrays: The arrays by name, as :func:`read_arrays` returns them.
@@ -121,10 +121,12 @@ def checked(arrays: Mapping[str, npt.NDArray[Any]], config: HeadConfig, where: s
         "embodiment_id": _embodiments(arrays["embodiment_id"], batch, config, where),
         "noise": _noise(arrays.get("noise"), batch, config, where),
         **{name: _mask(arrays.get(name), name, (batch, num_tokens), where) for name in MASKS},
-        "episode": _episodes(arrays.get("episode"), batch, where),
     }
     for name in FLOATS:
-        _check_finite(fields[name], name, where)
+        array = fields[name]
+        for row in range(0 if array is None else len(array)):  # one by one, because the file may be large
+            if not np.isfinite(array[row]).all():
+                raise InputError(f"{where}: {name}: NaN or infinity in row {row}, expected finite numbers")
     _check_masks(fields, config, where)
     return fields
 
@@ -190,24 +192,6 @@ def as_mask(where: str, name: str, array: npt.NDArray[Any] | None) -> BoolArray 
     if array.dtype.kind not in "iu" or not np.isin(array, (0, 1)).all():
         raise InputError(f"{where}: {name}: expected booleans, or 0 and 1")
     return np.asarray(array, dtype=np.bool_)
-
-
-def _episodes(given: npt.NDArray[Any] | None, batch: int, where: str) -> npt.NDArray[np.int64] | None:
-    if given is None:
-        return None
-    named = np.atleast_1d(given)
-    if named.dtype.kind not in "iu" or named.shape != (batch,):
-        raise InputError(
-            f"{where}: episode: {named.dtype} of shape {named.shape}, expected integers, ({batch},)"
-        )
-    return np.unique(named, return_inverse=True)[1].reshape(-1)
-
-
-def _check_finite(array: npt.NDArray[Any] | None, name: str, where: str) -> None:
-    """Row by row, because the file may be large."""
-    for row in range(0 if array is None else len(array)):
-        if not np.isfinite(array[row]).all():  # type: ignore[index]
-            raise InputError(f"{where}: {name}: NaN or infinity in row {row}, expected finite numbers")
 
 
 def _check_masks(fields: dict[str, Any], config: HeadConfig, where: str) -> None:

@@ -29,7 +29,7 @@ from saccade_lab.study.questions.sweeps import equal_mass
 if TYPE_CHECKING:
     from saccade.head.context import Context
     from saccade.head.head import ActionHead
-    from saccade.head.inputs import HeadInputs
+    from saccade_lab.head_inputs import HeadInputs
 
 Float64Array = npt.NDArray[np.float64]
 Tokens: TypeAlias = npt.NDArray[np.int64]

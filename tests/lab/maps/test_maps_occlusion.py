@@ -12,7 +12,7 @@ import torch
 import saccade
 from saccade import Intervention
 from saccade.errors import InputError
-from saccade.head.inputs import HeadInputs
+from saccade_lab.head_inputs import HeadInputs
 from saccade_lab.maps import occlusion
 from saccade_lab.maps.layout import parse_layout
 from saccade_lab.maps.occlusion import BlankedFrames, DroppedPositions, cell_for, measure, places_of

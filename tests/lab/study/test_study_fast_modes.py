@@ -14,7 +14,7 @@ import torch
 
 import saccade
 from saccade import InputError
-from saccade.head.inputs import HeadInputs
+from saccade_lab.head_inputs import HeadInputs
 from saccade_lab.reference import ActionHead as Reference
 from saccade_lab.reference import random_weights
 from saccade_lab.sim.policy import DEMO_CHECKPOINT

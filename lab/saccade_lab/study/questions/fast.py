@@ -14,8 +14,8 @@ import pandas as pd
 from saccade._internal.arrays import Float32Array
 from saccade._internal.flags import add_list
 from saccade.errors import InputError
-from saccade.head.inputs import HeadInputs
 from saccade_lab.flags import add_rollout_arguments, check_known
+from saccade_lab.head_inputs import HeadInputs
 from saccade_lab.study.arguments import source_of
 from saccade_lab.study.cell import Cell, Rows
 from saccade_lab.study.questions.fast_modes import (

@@ -10,7 +10,7 @@ import numpy as np
 from saccade._internal.arrays import ArrayLike, Float32Array
 from saccade.errors import InputError
 from saccade.head.context import Context
-from saccade.head.inputs import HeadInputs
+from saccade_lab.head_inputs import HeadInputs
 from saccade_lab.sim.policy import Policy
 from saccade_lab.sim.settings import EMBODIMENT_ID
 from saccade_lab.study.questions.fast_modes import Calibration, Mode, encode, sample

@@ -15,7 +15,7 @@ from saccade._internal.arrays import Float32Array
 from saccade.errors import InputError
 from saccade.head.context import Context
 from saccade.head.head import ActionHead
-from saccade.head.inputs import HeadInputs
+from saccade_lab.head_inputs import HeadInputs
 from saccade_lab.study.cell import digest
 
 BoolArray = npt.NDArray[np.bool_]

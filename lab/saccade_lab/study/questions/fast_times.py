@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from saccade.head.head import ActionHead
-from saccade.head.inputs import HeadInputs
+from saccade_lab.head_inputs import HeadInputs
 from saccade_lab.random_checkpoint import head as random_head
 from saccade_lab.study.cell import Rows
 from saccade_lab.study.questions.fast_modes import Calibration, Mode, encode, sample

@@ -22,10 +22,10 @@ import pandas as pd
 from saccade._internal.flags import add_integer
 from saccade.errors import InputError
 from saccade.head.input_files import MASKS
-from saccade.head.inputs import HeadInputs
 from saccade.head.intervention import ROW_GROUPS
 from saccade_lab.files import path_text
 from saccade_lab.flags import add_frames, add_rollout_arguments
+from saccade_lab.head_inputs import HeadInputs
 from saccade_lab.study.arguments import source_of
 from saccade_lab.study.arms import NO_TOKENS
 from saccade_lab.study.cell import Cell, Rows

@@ -14,9 +14,9 @@ import pandas as pd
 
 from saccade._internal.flags import add_list
 from saccade.head.head import ActionHead
-from saccade.head.inputs import HeadInputs
 from saccade.head.intervention import ROW_GROUPS, Intervention, Tokens
 from saccade_lab.flags import add_frames, add_rollout_arguments, check_known, indices
+from saccade_lab.head_inputs import HeadInputs
 from saccade_lab.study.arguments import source_of
 from saccade_lab.study.arms import NO_TOKENS
 from saccade_lab.study.cell import Cell, Rows

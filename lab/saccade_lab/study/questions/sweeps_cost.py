@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from saccade.head.head import ActionHead
-from saccade.head.inputs import HeadInputs
+from saccade_lab.head_inputs import HeadInputs
 from saccade_lab.study.cell import Rows
 from saccade_lab.study.runs import Run, describe_run
 from saccade_lab.study.statistics import bootstrap

@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from saccade._internal.arrays import Float32Array
+from saccade.errors import InputError
 from saccade.head.chunking import Chunking
 from saccade.head.config import HeadConfig
 from saccade.head.context import Context
@@ -32,13 +33,13 @@ class HeadInputs:
         noise: The noise that sampling starts from, ``(batch, action_horizon, encoder_action_dim)``, or with
             several draws for each row ``(batch, draws, action_horizon, encoder_action_dim)``; None before it
             is drawn.
-        attention_mask, image_mask, drop_vl: ``(batch, T_vl)`` bool, see :meth:`saccade.ActionHead.encode`; or
+        attention_mask, image_mask, drop_vl: ``(batch, T_vl)`` bool, see ``saccade.ActionHead.encode``; or
             None.
         episode: ``(batch,)`` int64, the episode of each row, counted from 0; None if unknown.
 
     Example:
         >>> import numpy as np, saccade
-        >>> from saccade.head.inputs import HeadInputs
+        >>> from saccade_lab.head_inputs import HeadInputs
         >>> head = saccade.ActionHead.from_pretrained(saccade.demo_checkpoint())
         >>> inputs = HeadInputs.random(head.config, num_vl_tokens=60, rng=np.random.default_rng(0))
         >>> inputs.sample(head).shape
@@ -79,7 +80,7 @@ class HeadInputs:
         """All observations of a file.
 
         Args:
-            path: A file that :func:`saccade.head.input_files.read_arrays` reads.
+            path: A file that ``saccade.head.input_files.read_arrays`` reads.
             config: Config of the head, which they are checked against.
 
         Raises:
@@ -96,14 +97,15 @@ class HeadInputs:
         """The observations in the arrays of a file.
 
         Args:
-            arrays: The arrays by name, as :func:`saccade.head.input_files.read_arrays` returns them.
+            arrays: The arrays by name, as ``saccade.head.input_files.read_arrays`` returns them.
             config: Config of the head, which they are checked against.
             where: Name of the file, for messages.
 
         Raises:
-            InputError, ShapeError: As :meth:`from_file`.
+            InputError, ShapeError: As ``from_file``.
         """
-        return cls(**checked(arrays, config, where))
+        fields = checked(arrays, config, where)
+        return cls(**fields, episode=_episodes(arrays.get("episode"), len(fields["state"]), where))
 
     def __len__(self) -> int:
         return len(self.backbone_features)
@@ -171,7 +173,7 @@ class HeadInputs:
         return dataclasses.replace(self, noise=self.noise[:, draw])
 
     def encode(self, head: ActionHead) -> Context:
-        """:meth:`saccade.ActionHead.encode` of the features with these masks."""
+        """``saccade.ActionHead.encode`` of the features with these masks."""
         return head.encode(
             self.backbone_features,
             attention_mask=self.attention_mask,
@@ -195,16 +197,16 @@ class HeadInputs:
 
         Args:
             head: The head that computes them.
-            context: The result of :meth:`encode` with this head. Default: it is computed.
+            context: The result of ``encode`` with this head. Default: it is computed.
             num_steps, integrator, future_refresh, intervention, previous_chunk, chunking: As in
-                :meth:`saccade.ActionHead.sample`.
+                ``saccade.ActionHead.sample``.
 
         Returns:
             ``(batch, action_horizon, action_dim)`` float32, or ``(batch, draws, action_horizon, action_dim)``
             if the noise has an axis of draws.
 
         Raises:
-            InputError, ShapeError, DtypeError: As :meth:`saccade.ActionHead.sample`.
+            InputError, ShapeError, DtypeError: As ``saccade.ActionHead.sample``.
         """
         has_draws = self.noise is not None and self.noise.ndim == 4
         found = head.sample(
@@ -234,15 +236,15 @@ class HeadInputs:
         steps: int | Sequence[int] | None = None,
         max_bytes: int = 2**31,
     ) -> Trace[Any]:
-        """:meth:`saccade.ActionHead.trace` from this noise, which must be a single draw.
+        """``saccade.ActionHead.trace`` from this noise, which must be a single draw.
 
         Args:
-            head, context: As in :meth:`sample`.
+            head, context: As in ``sample``.
             num_steps, intervention, record, blocks, steps, max_bytes: As in
-                :meth:`saccade.ActionHead.trace`.
+                ``saccade.ActionHead.trace``.
 
         Raises:
-            InputError, ShapeError, DtypeError: As :meth:`saccade.ActionHead.trace`.
+            InputError, ShapeError, DtypeError: As ``saccade.ActionHead.trace``.
         """
         return head.trace(
             self.encode(head) if context is None else context,
@@ -256,3 +258,14 @@ class HeadInputs:
             steps=steps,
             max_bytes=max_bytes,
         )
+
+
+def _episodes(given: npt.NDArray[Any] | None, batch: int, where: str) -> npt.NDArray[np.int64] | None:
+    if given is None:
+        return None
+    named = np.atleast_1d(given)
+    if named.dtype.kind not in "iu" or named.shape != (batch,):
+        raise InputError(
+            f"{where}: episode: {named.dtype} of shape {named.shape}, expected integers, ({batch},)"
+        )
+    return np.unique(named, return_inverse=True)[1].reshape(-1)

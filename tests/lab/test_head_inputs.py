@@ -13,7 +13,7 @@ import pytest
 import saccade
 from saccade.cli import main
 from saccade.errors import InputError, ShapeError
-from saccade.head.inputs import HeadInputs
+from saccade_lab.head_inputs import HeadInputs
 from saccade_lab.study.table import read_table
 from tests.helpers.released import Released, load_released
 
