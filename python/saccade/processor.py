@@ -40,8 +40,8 @@ class Processor:
             Default: lerobot's for N1.5, Isaac-GR00T's for N1.6 and N1.7.
         image_size: N1.5: height and width of a view. Default: 224.
         tokens_per_view: N1.5: image tokens of a view. Default: ``(image_size / 14) ** 2``.
-        plain_text: N1.5: insert the instruction into the prompt verbatim. Otherwise it is formatted as a
-            Python list, ``['open the drawer']``, as in both released processors.
+        plain_text: N1.5: insert the instruction into the prompt verbatim. Otherwise it is formatted as in the
+            released processors, ``['open the drawer']``.
         options: Keys of the released ``processor_config.json`` and ``preprocessor_config.json``, such as
             ``shortest_image_edge``, ``crop_fraction``, ``min_pixels`` or ``formalize_language``. If
             ``use_albumentations`` is among them, they are read as a released file: a key that is missing has
@@ -112,19 +112,16 @@ class Processor:
             id_or_path, revision: As for :meth:`saccade.ActionHead.from_pretrained`.
             preprocessing: As for the class. Default: lerobot for a checkpoint that lerobot wrote, otherwise
                 Isaac-GR00T.
-            tokenizer: A ``tokenizer.json``, a directory, or the id of a published tokenizer. Default: the
-                checkpoint's own, otherwise the published tokenizer of its release.
+            tokenizer: As for the class. Default: the checkpoint's own, otherwise the published tokenizer of
+                its release.
             options: Options that replace those of the checkpoint, such as ``{"letter_box_transform": True}``,
                 because some files do not contain the options of the training.
 
         Raises:
-            InputError: An argument has the wrong type or an unknown value. An option is unknown to its
-                release or does not fit the others, or one that is given concerns states or actions.
+            InputError: As the class, or an option that is given concerns states or actions.
             CheckpointError: The checkpoint or tokenizer is broken or of another kind, or its files have a
                 step that is not known.
-            FileNotFoundError: The checkpoint or the tokenizer does not exist, or cannot be downloaded. The
-                message names the files and ids that are needed.
-            PermissionError: The Hub denies access to an id.
+            FileNotFoundError, PermissionError: As the class. The message names the files and ids.
 
         Example:
             >>> import saccade

@@ -134,9 +134,6 @@ class Backbone(Loaded[_saccade.Backbone, BackboneConfig]):
                 ``"image_tokens"`` (the tokens of each view). With a record nothing is taken from
                 ``previous``.
 
-        Returns:
-            The features, masks, and where the tokens of each view are.
-
         Raises:
             ShapeError, DtypeError, InputError: The inputs do not fit the backbone or each other, are not
                 finite, or ``previous`` is of another backbone.
@@ -147,7 +144,7 @@ class Backbone(Loaded[_saccade.Backbone, BackboneConfig]):
     def encode_many(
         self, inputs: Sequence[BackboneInputs], *, previous: Sequence[BackboneFeatures] = ()
     ) -> list[BackboneFeatures]:
-        """Computes the features of several inputs in one pass. Their prompts may differ in length.
+        """Computes the features of each of ``inputs`` in one pass. Their prompts may differ in length.
 
         Nothing is padded. All rows share the linear layers, and all views the vision tower. The features of
         each have the bits that it has alone.
@@ -155,9 +152,6 @@ class Backbone(Loaded[_saccade.Backbone, BackboneConfig]):
         Args:
             inputs: Pixels and token ids.
             previous: Features that any of the inputs may take from, as in :meth:`__call__`.
-
-        Returns:
-            The features of each of ``inputs``, in their order.
 
         Raises:
             ShapeError, DtypeError, InputError, MemoryError: As :meth:`__call__`.
@@ -167,21 +161,18 @@ class Backbone(Loaded[_saccade.Backbone, BackboneConfig]):
     def _encode(
         self, inputs: list[BackboneInputs], previous: list[BackboneFeatures], record: Sequence[str]
     ) -> list[BackboneFeatures]:
-        for name, values, kind in (
-            ("inputs", inputs, BackboneInputs),
-            ("previous", previous, BackboneFeatures),
-        ):
+        kinds = ("inputs", inputs, BackboneInputs), ("previous", previous, BackboneFeatures)
+        for name, values, kind in kinds:
             for value in values:
                 if not isinstance(value, kind):
                     raise InputError(f"{name}: expected saccade.{kind.__name__}, got {type(value).__name__}")
         keep = check_record(record, RECORDS)
-        encoded = self._engine.encode(
-            [_plain(given) for given in inputs], [given._held for given in previous], *keep
-        )
+        held = [given._held for given in previous]
+        encoded = self._engine.encode([_plain(given) for given in inputs], held, *keep)
         token = self.config.image_token_id
         return [
-            made(held, recorded if any(keep) else None, given, token)
-            for (held, recorded), given in zip(encoded, inputs, strict=True)
+            made(found, recorded if any(keep) else None, given, token)
+            for (found, recorded), given in zip(encoded, inputs, strict=True)
         ]
 
     def __repr__(self) -> str:

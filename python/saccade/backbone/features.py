@@ -162,11 +162,7 @@ def made(
 
 
 def view_names(given: tuple[str, ...] | None, count: int) -> tuple[str, ...]:
-    """The names of ``count`` views.
-
-    Raises:
-        InputError: Another number of names was given.
-    """
+    """The names of ``count`` views. Another number of given names raises an ``InputError``."""
     if given is None:
         return tuple(f"view_{index + 1}" for index in range(count))
     if len(given) != count:

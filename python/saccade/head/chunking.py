@@ -13,8 +13,8 @@ from saccade.errors import InputError
 class Chunking:
     """How a chunk continues the previous one.
 
-    While a robot executes a chunk, the next one is computed. The first actions of the next chunk must agree
-    with the actions that the robot executes meanwhile. Otherwise the robot jerks at the transition.
+    The next chunk is computed while a robot executes a chunk. If its first actions do not agree with those
+    that are executed meanwhile, the robot jerks at the transition.
 
     The last ``overlap`` of the first ``horizon`` actions of the previous chunk become the first actions of
     the new one, in place of noise. The velocity of action ``j`` is multiplied by a factor: 0 for the first
@@ -36,10 +36,8 @@ class Chunking:
         InputError: A number is out of range.
 
     Example:
-        A robot executes 8 actions of a chunk of 16 and then needs the next chunk, which takes as long to
-        compute as 3 actions take to execute. Therefore the next chunk is requested after 5 of the 8 actions.
-        It begins with the last 11 actions of the old one, the first 3 of which are executed while it is
-        computed:
+        A robot executes 8 actions of a chunk of 16, and computing the next chunk takes as long as 3 actions.
+        It is requested after 5 of the 8 actions, so it begins with the last 11 actions of the old one:
 
         >>> import numpy as np, saccade
         >>> head = saccade.ActionHead.from_pretrained(saccade.demo_checkpoint())

@@ -42,9 +42,9 @@ class ActionHead(LoadedHead):
     the same bits in any batch, with any ``num_samples`` and with any number of threads.
 
     A checkpoint of GR00T-H may contain ``dropout_prob_by_embodiment``, ``(num_embodiments,)``: how often its
-    training set the state of each embodiment to zero. As in the released code, the states of embodiments with
-    an entry above 0.999 are set to zero here too, so they have no effect. The other entries act in training
-    only. The tensor is ignored if ``state_dropout_prob_per_embodiment`` is null or empty in the config.
+    training set the state of each embodiment to zero. As in the released code, states with an entry above
+    0.999 are set to zero here too; other entries act in training only. The tensor is ignored if
+    ``state_dropout_prob_per_embodiment`` is null or empty in the config.
 
     Example:
         The head of the bundled demo policy, on the features of two observations:
@@ -92,9 +92,7 @@ class ActionHead(LoadedHead):
                 block of the VL self-attention) and ``"hidden"`` (the tokens after each block). At most 2 GiB.
 
         Raises:
-            ShapeError, DtypeError, InputError: An argument does not fit the head, is not finite, or asks for
-                a record of more than 2 GiB.
-            MemoryError: There is not enough memory.
+            ShapeError, DtypeError, InputError, MemoryError: As :meth:`sample`, or the record is too large.
         """
         use_torch = is_torch(backbone_features)
         attention, hidden = check_record(record)

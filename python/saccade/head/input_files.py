@@ -29,10 +29,10 @@ def read_arrays(path: Path) -> dict[str, npt.NDArray[Any]]:
 
     It contains ``backbone_features (batch, T_vl, context_dim)``, ``state (batch, state_dim)`` and
     ``embodiment_id``. It may contain ``noise (batch, action_horizon, encoder_action_dim)``; ``input_ids``,
-    ``image_mask``, ``attention_mask`` and ``drop_vl``, each ``(batch, T_vl)``; ``images (batch, cameras, H,
-    W, 3)`` uint8; ``tokens (batch, T_vl)`` strings; ``episode (batch,)`` integers. A file with one row may
-    leave out the batch axis of the optional arrays. Names may be prefixed with ``_in.``. In a safetensors
-    file, which cannot contain strings, ``tokens`` is a JSON list in the metadata.
+    ``image_mask``, ``attention_mask``, ``drop_vl`` and ``tokens`` (strings), each ``(batch, T_vl)``; ``images
+    (batch, cameras, H, W, 3)`` uint8; ``episode (batch,)`` integers. A file with one row may leave out the
+    batch axis of the optional arrays. Names may be prefixed with ``_in.``. In a safetensors file ``tokens``
+    is a JSON list in the metadata.
 
     Args:
         path: ``.npz`` or ``.safetensors``.
@@ -57,9 +57,8 @@ def read_arrays(path: Path) -> dict[str, npt.NDArray[Any]]:
     }
     missing = [name for name in REQUIRED if name not in arrays]
     if missing:
-        raise InputError(
-            f"{path}: no {', '.join(missing)}; there are {', '.join(sorted(found)) or 'no arrays'}"
-        )
+        there = ", ".join(sorted(found)) or "no arrays"
+        raise InputError(f"{path}: no {', '.join(missing)}; there are {there}")
     wrong = [name for name in FLOATS if name in arrays and arrays[name].dtype.kind != "f"]
     if wrong:
         raise InputError(f"{path}: {', '.join(wrong)}: expected floating point values")
@@ -115,13 +114,19 @@ def checked(arrays: Mapping[str, npt.NDArray[Any]], config: HeadConfig, where: s
     if not features.size:
         raise InputError(f"{where}: backbone_features: shape {features.shape}, expected no empty axis")
     batch, num_tokens, _ = features.shape
+    states: list[tuple[int, ...]] = [(batch, config.num_states, config.state_dim)]
+    if config.num_states == 1:
+        states.insert(0, (batch, config.state_dim))
+    noise = (batch, config.action_horizon, config.encoder_action_dim)
     fields: dict[str, Any] = {
         "backbone_features": features,
-        "state": _state(arrays["state"], batch, config, where),
+        "state": _of_shape(f"{where}: state", arrays["state"], *states),
         "embodiment_id": _embodiments(arrays["embodiment_id"], batch, config, where),
-        "noise": _noise(arrays.get("noise"), batch, config, where),
-        **{name: _mask(arrays.get(name), name, (batch, num_tokens), where) for name in MASKS},
+        "noise": _with_batch(f"{where}: noise", arrays.get("noise"), noise),
     }
+    for name in MASKS:
+        mask = as_mask(where, name, arrays.get(name))
+        fields[name] = _with_batch(f"{where}: {name}", mask, (batch, num_tokens))
     for name in FLOATS:
         array = fields[name]
         for row in range(0 if array is None else len(array)):  # one by one, because the file may be large
@@ -129,17 +134,6 @@ def checked(arrays: Mapping[str, npt.NDArray[Any]], config: HeadConfig, where: s
                 raise InputError(f"{where}: {name}: NaN or infinity in row {row}, expected finite numbers")
     _check_masks(fields, config, where)
     return fields
-
-
-def _state(given: npt.NDArray[Any], batch: int, config: HeadConfig, where: str) -> npt.NDArray[Any]:
-    state = np.asarray(given)
-    shapes: list[tuple[int, ...]] = [(batch, config.num_states, config.state_dim)]
-    if config.num_states == 1:
-        shapes.insert(0, (batch, config.state_dim))
-    if state.shape not in shapes:
-        expected = " or ".join(map(str, shapes))
-        raise ShapeError(f"{where}: state: shape {state.shape}, expected {expected}")
-    return state
 
 
 def _embodiments(
@@ -156,27 +150,19 @@ def _embodiments(
     return np.broadcast_to(ids.reshape(-1).astype(np.int64), batch)
 
 
-def _noise(
-    given: npt.NDArray[Any] | None, batch: int, config: HeadConfig, where: str
-) -> npt.NDArray[Any] | None:
+def _of_shape(name: str, given: npt.NDArray[Any], *shapes: tuple[int, ...]) -> npt.NDArray[Any]:
+    array = np.asarray(given)
+    if array.shape not in shapes:
+        raise ShapeError(f"{name}: shape {array.shape}, expected {' or '.join(map(str, shapes))}")
+    return array
+
+
+def _with_batch(name: str, given: npt.NDArray[Any] | None, shape: tuple[int, ...]) -> npt.NDArray[Any] | None:
+    """An optional array. A file with one row may leave out its axis of the batch."""
     if given is None:
         return None
-    shape = (batch, config.action_horizon, config.encoder_action_dim)
-    noise = np.asarray(given)
-    if batch == 1 and noise.ndim == 2:
-        noise = noise[None]
-    if noise.shape != shape:
-        raise ShapeError(f"{where}: noise: shape {noise.shape}, expected {shape}")
-    return noise
-
-
-def _mask(given: npt.NDArray[Any] | None, name: str, shape: tuple[int, int], where: str) -> BoolArray | None:
-    found = as_mask(where, name, given)
-    if found is not None and shape[0] == 1 and found.ndim == 1:
-        found = found[None]
-    if found is not None and found.shape != shape:
-        raise ShapeError(f"{where}: {name}: shape {found.shape}, expected {shape}")
-    return found
+    lacks_batch = shape[0] == 1 and np.ndim(given) == len(shape) - 1
+    return _of_shape(name, given[None] if lacks_batch else given, shape)
 
 
 def as_mask(where: str, name: str, array: npt.NDArray[Any] | None) -> BoolArray | None:

@@ -30,35 +30,30 @@ class Intervention:
     :class:`saccade_lab.reference.ActionHead` accepts the same object.
 
     The groups of tokens are ``"state"``, ``"future"`` and ``"action"``, which are the rows of the head, and
-    ``"vl"``, the vision-language tokens. ``(group, indices)`` selects some tokens of a group. As the key of a
+    ``"vl"``, the vision-language tokens. ``(group, indices)`` selects some tokens of a group; as the key of a
     mapping it must be hashable: ``("future", (0, 1))``. All observations and samples of a call are changed in
     the same way.
 
-    Cross-attention blocks have ``vl`` keys, and self-attention blocks have ``state``, ``future`` and
-    ``action`` keys. Therefore an edge (reader, source) exists in cross-attention blocks if the source is
-    ``vl``, and otherwise in self-attention blocks. A cut or bias has no effect in the other kind of block. If
-    it exists in none of the ``blocks``, the call raises an ``InputError``, because a result without effect
-    would be misleading. The same holds for a choice of no tokens. With interleaved self-attention, the even
-    blocks are cross-attention and the odd blocks are self-attention.
-
-    Indices of ``vl`` count all positions, also in blocks that attend only to text or only to images. Tokens
-    that such a block does not attend to are not affected there.
+    Cross-attention blocks have ``vl`` keys; self-attention blocks have ``state``, ``future`` and ``action``
+    keys. A cut or bias acts in the blocks that have the keys of its source. If none of the ``blocks`` has
+    them, or no tokens are chosen, the call raises an ``InputError``, because a result without effect would be
+    misleading. With interleaved self-attention, even blocks are cross-attention and odd blocks
+    self-attention. Indices of ``vl`` count all positions, also in blocks that attend only to text or only to
+    images.
 
     Several interventions in a sequence act together. Their biases add up. If two of them patch the same row,
     the later one applies. At most one may replace the future tokens.
 
     Args:
-        cut: Pairs ``(reader, source)``. The rows of the reader no longer attend to the keys of the source. If
-            a row has no key left, its attention is zero, and the block adds only the bias of its output
-            layer.
+        cut: Pairs ``(reader, source)``. The rows of the reader no longer attend to the keys of the source. A
+            row without keys has zero attention: the block adds only the bias of its output layer.
         key_bias: For a group, a number or an array ``(tokens,)`` that is added to the logits of its keys for
             every reader. Minus infinity removes a key.
         patch: ``{(step, block): {group: rows}}``. Replaces rows after that block. ``rows`` is ``(tokens,
             width)`` or ``(batch, tokens, width)``. A patch has its own step and block; ``blocks``, ``steps``
             and ``heads`` do not apply to it.
-        future_tokens: ``(N', width)``, used at every step in place of the learned future tokens. N' may be
-            any number, 0 included, and the group ``future`` then has N' tokens. The ``future_key_bias`` of
-            the config is not applied to them.
+        future_tokens: ``(N', width)``, used at every step in place of the learned ones, without the
+            ``future_key_bias`` of the config. N' may be any number, 0 included.
         blocks: The blocks where cuts and biases apply. Default: all.
         steps: The steps at which they apply. Default: all. ``velocity`` is step 0.
         heads: The attention heads in which they apply. Default: all.
@@ -96,11 +91,7 @@ class Intervention:
 
 
 def as_interventions(given: Intervention | Sequence[Intervention] | None) -> tuple[Intervention, ...]:
-    """No, one or several interventions as a tuple.
-
-    Raises:
-        InputError: ``given`` is anything else.
-    """
+    """No, one or several interventions as a tuple. Anything else raises an ``InputError``."""
     if given is None:
         return ()
     several: Any = (given,) if isinstance(given, Intervention) else given
