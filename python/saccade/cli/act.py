@@ -132,11 +132,7 @@ class Clock:
 
 
 def named_pictures(given: list[str]) -> dict[str, Path]:
-    """Files by camera; the name is empty if it was left out.
-
-    Raises:
-        UsageError: A camera occurs twice, or one of several has no name.
-    """
+    """Files by camera; the name is empty if it was left out."""
     found: dict[str, Path] = {}
     for word in given:
         name, separator, file = word.partition("=")

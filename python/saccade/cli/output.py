@@ -31,11 +31,7 @@ class OutputError(Exception):
 
 
 def prepare_streams() -> None:
-    """Makes both streams accept any text, whatever their encoding is.
-
-    Raises:
-        OutputError: Standard output is closed.
-    """
+    """Makes both streams accept any text in any encoding; `OutputError` if standard output is closed."""
     if sys.stdout is None:
         raise OutputError("standard output is closed")
     if sys.stderr is None:
@@ -64,12 +60,7 @@ def replace_with_ascii(error: UnicodeError) -> tuple[str, int]:
 
 
 def flush() -> None:
-    """Flushes standard output.
-
-    Raises:
-        BrokenPipeError: Whoever read it is gone.
-        OutputError: It cannot be written.
-    """
+    """Flushes standard output: `BrokenPipeError` if its reader is gone, else `OutputError`."""
     try:
         sys.stdout.flush()
     except BrokenPipeError:
@@ -110,12 +101,7 @@ def _console_class() -> type[Console]:
 
 
 def console(*, stderr: bool = False, width: int | None = None) -> Console:
-    """A console of rich.
-
-    Args:
-        stderr: Whether to write to standard error.
-        width: Characters in a line where the output is not a terminal; None for rich's 80.
-    """
+    """A console of rich; `width` characters in a line where it is not a terminal, None for rich's 80."""
     made = _console_class()(stderr=stderr)
     if width is not None and not made.is_terminal and "COLUMNS" not in os.environ:
         made.width = width
@@ -200,11 +186,7 @@ def progress_bar(
 ) -> Iterator[Update]:
     """A progress bar on standard error; without a terminal or rich, at most one line a minute.
 
-    Args:
-        description: Description of the work.
-        total: Number of items; None if it is not known yet.
-        in_bytes: Whether to show megabytes instead of a count.
-        transient: Whether to remove the bar at the end.
+    `in_bytes` shows megabytes instead of a count, and a `transient` bar is removed at the end.
     """
     shown = None
     with contextlib.suppress(ModuleNotFoundError):

@@ -335,14 +335,7 @@ def check_inputs(
 
 
 def agree(module: nn.Module, head: ActionHead, inputs: tuple[Features, Features], rounded: bool) -> Kinds:
-    """Compares both on the same inputs, from the same state of torch's generator.
-
-    Args:
-        module: The original.
-        head: Its copy in saccade.
-        inputs: Backbone output and action input.
-        rounded: Whether one of the two rounds to 8 bits.
-    """
+    """Compares both on the same inputs and state of torch's generator; `rounded` if one rounds to 8 bits."""
     backbone_output, action_input = inputs
     device = backbone_output.backbone_features.device
     theirs_output = Features(backbone_output)

@@ -20,15 +20,9 @@ RECORDERS = ("transformers.utils.generic", "transformers.utils.output_capturing"
 
 
 def find(policy: object, is_wanted: Callable[[nn.Module], bool], wanted: str) -> nn.Module:
-    """The only module in `policy` that is wanted.
+    """The only module in `policy` that is wanted, which messages call `wanted`.
 
-    Args:
-        policy: The module itself, a module that contains it, or an object that contains such a module.
-        is_wanted: Whether a module is one.
-        wanted: How a message names it.
-
-    Raises:
-        InputError: There is none, or more than one, or it is compiled.
+    `policy` is the module itself, a module that contains it, or an object that contains such a module.
     """
     held: Any = policy
     for _ in range(len(HOLDERS)):
