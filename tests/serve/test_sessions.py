@@ -84,7 +84,7 @@ def test_continuing_asks_for_what_was_executed() -> None:
     session = Sessions(1, 1.0).use("a", None)
     assert session.continued(Options(session="a"), 1) is None
     session.chunk = Chunk({}, 1, 8)
-    with pytest.raises(InputError, match="reset begins anew"):
+    with pytest.raises(InputError, match="reset starts a new chunk"):
         session.continued(Options(session="a"), 1)
     assert session.continued(Options(session="a", executed=8), 1) is None
     found = session.continued(Options(session="a", executed=6, frozen=5), 1)

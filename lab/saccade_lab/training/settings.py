@@ -13,7 +13,7 @@ STATE_FILE = "training.pt"
 
 
 def features_name(start_sha256: str, recording_sha256: str, samples: str) -> str:
-    """The name of a file with the features of a frozen backbone, which stands beside the runs that share it.
+    """The name of a file with the features of a frozen backbone, next to the runs that share it.
 
     Args:
         start_sha256: Hash of the backbone's tensors.

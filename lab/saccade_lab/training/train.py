@@ -384,7 +384,7 @@ def train(
         settings: Settings of the run.
         on_step: Called after each step.
         start: A policy to start from; None for random weights. Where only the head is trained, the features
-            of its backbone are kept in files beside ``out``, for other runs.
+            of its backbone are kept in files next to ``out``, for other runs.
 
     Returns:
         The config of the policy.

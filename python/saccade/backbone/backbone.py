@@ -53,7 +53,7 @@ class Backbone(Loaded[_saccade.Backbone, BackboneConfig]):
 
         The tensors of the backbone have the prefix ``backbone.``, ``_groot_model.backbone.`` or none. The
         version is recognised by their names. Tensors outside the prefix are ignored. Inside it every tensor
-        must be known, present and of the right shape. The pooling head of SigLIP, ``lm_head`` beside
+        must be known, present and of the right shape. The pooling head of SigLIP, ``lm_head`` next to
         ``embed_tokens``, and layers of the language model from ``select_layer`` on are not read.
 
         Args:

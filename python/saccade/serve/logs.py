@@ -28,7 +28,7 @@ MOST_LINES = 10_000
 MOST_WARNINGS = 20
 #: Back to the start of the line of a terminal, and erases it.
 ERASE = "\r\x1b[2K"
-#: Latencies are those of so many answers, the last ones.
+#: Number of answers, the last ones, whose latencies are kept.
 WINDOW = 1024
 
 
@@ -49,7 +49,7 @@ class Statistics:
         self.errors += is_error
 
     def computed(self, batch: int, milliseconds: Mapping[str, float]) -> None:
-        """Takes notice of actions, of which so many observations were computed together."""
+        """Counts actions and the number of observations that were computed together."""
         self._computed.append((time.monotonic(), batch, milliseconds))
 
     def summary(self) -> dict[str, Any]:

@@ -118,6 +118,6 @@ def _array(
     try:
         array = np.frombuffer(data, dtype) if len(data) else np.empty(shape, dtype)
         array = array.reshape(shape, order="F" if is_fortran else "C")
-    except ValueError as error:  # sizes beside a zero that NumPy cannot multiply
+    except ValueError as error:  # sizes next to a zero that NumPy cannot multiply
         raise ShapeError(f"array: shape {shape!r:.100}: {error}") from None
     return array if dtype.isnative else array.astype(dtype.newbyteorder("="))

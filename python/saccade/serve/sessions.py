@@ -32,7 +32,7 @@ class Session:
     chunk: Chunk | None = None  # the last one
 
     def continued(self, options: Options, rows: int) -> tuple[Chunk, Chunking] | None:
-        """The chunk that a request of so many observations continues, and how; None if there is none.
+        """The chunk that a request continues, and how; None if there is none.
 
         Raises:
             InputError: The request does not say how many actions were executed, is for another number of
@@ -48,7 +48,7 @@ class Session:
             raise InputError(
                 "options: executed: expected the number of actions that were executed of the last chunk of "
                 f"session {options.session!r:.100}, or {', '.join(RELEASED_CHUNKING)}, got none; "
-                "reset begins anew"
+                "reset starts a new chunk"
             )
         if rows != chunk.rows:
             raise InputError(

@@ -149,7 +149,7 @@ class Transport:
             self._waker.send(b"\0")
 
     def requests(self, timeout: float) -> Iterator[tuple[Peer, list[bytes], memoryview]]:
-        """Client, frames before the request, and request, of those that arrive within so many seconds."""
+        """Client, frames before the request, and request, of those that arrive within ``timeout`` seconds."""
         if any(ready == self._woken.fileno() for ready, _ in self._poller.poll(int(1e3 * timeout))):
             with contextlib.suppress(BlockingIOError):
                 while self._woken.recv(4096):
