@@ -216,7 +216,8 @@ def test_what_torch_constructs_is_as_drawn_and_anything_else_is_not(name: str) -
         assert verdict(tensor.bfloat16()) is True
     assert verdict(tensor * 1.2 + 0.01) is False
     if drawn.kind == "uniform":
-        assert verdict(torch.randn(200, 96) * drawn.std) is False  # the same spread, another distribution
+        spread = drawn.scale / math.sqrt(3.0)  # the standard deviation, of another distribution
+        assert verdict(torch.randn(200, 96) * spread) is False
 
 
 def test_too_few_numbers_are_not_judged() -> None:

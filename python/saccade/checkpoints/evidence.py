@@ -22,6 +22,13 @@ RELATED = 0.5
 #: Number of future tokens of the published checkpoints.
 PUBLISHED_TOKENS = 32
 
+#: What it means whether the future tokens are distributed as before training: the side, and the words.
+VERDICTS = {
+    True: ("for", "distributed as"),
+    False: ("against", "not distributed as"),
+    None: ("neither", "too few to compare with"),
+}
+
 #: Parts whose distribution is evidence.
 JUDGED = ("DiT blocks", "VL self-attention", "timestep encoder", "output projections")
 
@@ -69,8 +76,11 @@ def from_noise(
             f"{name}: {part.as_drawn} of {part.judged} tensors are distributed as before any training"
         )
     if tokens is not None:
-        side = {True: "for", False: "against", None: "neither"}[tokens.as_drawn]
-        found[side].append(_of_tokens(tokens))
+        side, verdict = VERDICTS[tokens.as_drawn]
+        found[side].append(
+            f"future tokens: {verdict} N(0, {NORMAL_STD}), distance {tokens.distance:.3f}, "
+            f"standard deviation {tokens.std:.4f}"
+        )
         if tokens.count != PUBLISHED_TOKENS:
             found["neither"].append(
                 f"{tokens.count} future tokens, whereas published checkpoints have {PUBLISHED_TOKENS}: a "
@@ -94,18 +104,6 @@ def from_noise(
             f"a shape differs from the reference: {shape}" for shape in reference.different_shapes
         ]
     return found
-
-
-def _of_tokens(tokens: TokenStatistics) -> str:
-    verdict = {
-        True: "distributed as",
-        False: "not distributed as",
-        None: "too few to compare with",
-    }[tokens.as_drawn]
-    return (
-        f"future tokens: {verdict} N(0, {NORMAL_STD}), distance {tokens.distance:.3f}, standard deviation "
-        f"{tokens.std:.4f}"
-    )
 
 
 def _likeness(part: PartResemblance) -> tuple[str, str]:

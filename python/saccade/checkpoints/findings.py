@@ -39,13 +39,13 @@ def in_order(parts: Mapping[str, FoundT]) -> dict[str, FoundT]:
     return {name: parts[name] for name in (*PARTS, UNUSED) if name in parts}
 
 
-@dataclass(frozen=True)
+@dataclass
 class Counts:
     """Tensors outside the head that belong to one module."""
 
-    tensors: int
+    tensors: int = 0
     """Number of tensors."""
-    nbytes: int
+    nbytes: int = 0
     """Size in the file, in bytes."""
 
 

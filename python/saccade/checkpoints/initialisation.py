@@ -39,20 +39,12 @@ Array = npt.NDArray[np.floating[Any]]
 
 @dataclass(frozen=True)
 class Draw:
-    """A distribution.
-
-    Attributes:
-        kind: ``"normal"`` (with mean zero), ``"uniform"`` (symmetric about zero) or ``"constant"``.
-        scale: The standard deviation, the bound, or the constant.
-    """
+    """A distribution."""
 
     kind: str
+    """``"normal"`` (with mean zero), ``"uniform"`` (symmetric about zero) or ``"constant"``."""
     scale: float
-
-    @property
-    def std(self) -> float:
-        """Standard deviation of the distribution."""
-        return {"normal": self.scale, "uniform": self.scale / math.sqrt(3.0), "constant": 0.0}[self.kind]
+    """The standard deviation, the bound, or the constant."""
 
     def cdf(self, values: Array) -> Array:
         """Cumulative distribution function of a normal or uniform distribution."""
@@ -62,11 +54,9 @@ class Draw:
 
 
 def draw(name: str, inputs: int) -> Draw:
-    """The distribution of a tensor of the head before training.
+    """The distribution of a tensor of the head before training, by its name without prefix.
 
-    Args:
-        name: Name of the tensor without prefix.
-        inputs: Number of inputs of the linear layer that it belongs to. Not used for other tensors.
+    ``inputs`` is the number of inputs of the linear layer that it belongs to, if it is one's.
     """
     if name.endswith(".W") or name in ("future_tokens.weight", "position_embedding.weight"):
         return Draw("normal", NORMAL_STD)
@@ -104,11 +94,7 @@ def distance(values: Array, drawn: Draw) -> float:
 
 
 def is_as_drawn(values: Array, drawn: Draw) -> bool | None:
-    """Whether a sample may come from a distribution. This holds for 999 of 1000 untrained tensors.
-
-    Returns:
-        None if the sample is too small.
-    """
+    """Whether a sample may come from a distribution, as of 999 of 1000 untrained tensors; None if small."""
     if drawn.kind == "constant":
         return distance(values, drawn) == 0.0
     if values.size < LEAST_SAMPLE:

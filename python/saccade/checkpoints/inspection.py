@@ -96,11 +96,10 @@ def _outside(description: Description) -> dict[str, Counts]:
     """Tensors outside the head by the first component of their names."""
     counted: dict[str, Counts] = {}
     for tensor in description.tensors:
-        if tensor.name.startswith(description.prefix):
-            continue
-        module = tensor.name.removeprefix("_groot_model.").partition(".")[0]
-        counts = counted.get(module, Counts(0, 0))
-        counted[module] = Counts(counts.tensors + 1, counts.nbytes + tensor.nbytes)
+        if not tensor.name.startswith(description.prefix):
+            counts = counted.setdefault(tensor.name.removeprefix("_groot_model.").partition(".")[0], Counts())
+            counts.tensors += 1
+            counts.nbytes += tensor.nbytes
     return counted
 
 
@@ -109,9 +108,8 @@ def _embodiment_names(description: Description) -> dict[int, list[str]]:
     path = Path(description.source)
     first = description.files[0].path if description.files else path
     folder = path if path.is_dir() else Path(first).parent
-    known = IDS[description.version]
     names: dict[int, list[str]] = {}
-    for name, index in (_mapping(folder) or known).items():
+    for name, index in (_mapping(folder) or IDS[description.version]).items():
         names.setdefault(index, []).append(name)
     return names
 

@@ -12,12 +12,7 @@ from saccade.checkpoints.initialisation import NORMAL_STD, Draw, distance, is_as
 
 
 def token_statistics(tokens: Float32Array, key_bias: Sequence[float] | None = None) -> TokenStatistics:
-    """Statistics of future tokens.
-
-    Args:
-        tokens: ``(N, width)``, at least one token.
-        key_bias: The ``future_key_bias`` of the config.
-    """
+    """Statistics of future tokens ``(N, width)``, at least one, and the ``future_key_bias`` of the config."""
     drawn = NORMAL_STD * np.random.default_rng(0).standard_normal(tokens.shape, np.float32)
     values, fresh = sample(tokens), Draw("normal", NORMAL_STD)
     _, index, counts = np.unique(tokens, axis=0, return_inverse=True, return_counts=True)
