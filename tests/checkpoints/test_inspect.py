@@ -21,8 +21,7 @@ from saccade.checkpoints import quantize
 from saccade.checkpoints.findings import Counts, Inspection, Part, in_order, part_of
 from saccade.checkpoints.initialisation import Draw, distance, draw, is_as_drawn, sample
 from saccade.checkpoints.inspection import inspect
-from saccade.checkpoints.survey import robust_z
-from saccade.checkpoints.tokens import token_statistics
+from saccade.checkpoints.survey import robust_z, token_statistics
 from saccade.errors import CheckpointError
 from saccade_lab.reference.random_weights import CONFIGS, whole_config
 from tests.helpers import layout_heads, layouts

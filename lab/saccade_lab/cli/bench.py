@@ -19,7 +19,7 @@ from saccade._internal import flags as arguments
 from saccade._internal.arrays import PRECISIONS
 from saccade._internal.flags import UsageError
 from saccade._internal.hub import resolve
-from saccade.checkpoints.bundled import demo_checkpoint
+from saccade.checkpoints import demo_checkpoint
 from saccade.checkpoints.whole import robots_of
 from saccade.cli import EXIT_OK, output
 from saccade.errors import SaccadeError

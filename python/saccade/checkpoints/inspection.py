@@ -13,8 +13,7 @@ from saccade.checkpoints.description import Config, Description, Source, descrip
 from saccade.checkpoints.evidence import from_noise, odd_embodiments, odd_tokens
 from saccade.checkpoints.findings import Counts, Inspection, Memory
 from saccade.checkpoints.resemblance import Reference
-from saccade.checkpoints.survey import Survey
-from saccade.checkpoints.tokens import token_statistics
+from saccade.checkpoints.survey import Survey, token_statistics
 from saccade.checkpoints.whole import backbone_of, robots_of
 from saccade.errors import InputError, SaccadeError
 from saccade.head.config import to_json

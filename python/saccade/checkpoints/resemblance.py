@@ -9,8 +9,7 @@ import numpy as np
 from saccade.checkpoints.description import Source, open_published
 from saccade.checkpoints.findings import PartResemblance, Resemblance, in_order, part_of
 from saccade.checkpoints.initialisation import is_norm
-from saccade.checkpoints.survey import Slice, dot
-from saccade.checkpoints.tokens import spread_of
+from saccade.checkpoints.survey import Slice, dot, spread_of
 
 
 class Reference:
