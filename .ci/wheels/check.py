@@ -75,7 +75,7 @@ def check_cross_attention() -> float:
 
 def sample(source: Path, precision: str) -> npt.NDArray[np.float32]:
     """Actions of a head on fixed inputs."""
-    head = saccade.ActionHead.load(source, precision=precision)
+    head = saccade.ActionHead.from_pretrained(source, precision=precision)
     config = head.config
     RANDOM.seed(7)
     features, state = uniform(2, 21, config.context_dim), uniform(2, config.state_dim)

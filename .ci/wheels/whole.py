@@ -4,15 +4,17 @@
     python .ci/wheels/whole.py WHEEL --small                a few MB
     python .ci/wheels/whole.py WHEEL --checkpoint FOLDER    a checkpoint that exists
 
-Makes a virtual environment, installs the wheel, writes a random checkpoint with it, loads that at each
-precision in a process of its own and acts from arrays and an instruction. Prints a table. A failure is named
-in its row, and the exit status is then 1. Needs Python's standard library alone.
+Makes a virtual environment, installs the wheel, writes a random checkpoint with it (by the lab's source,
+which needs NumPy alone), loads that at each precision in a process of its own and acts from arrays and an
+instruction. Prints a table. A failure is named in its row, and the exit status is then 1. Needs Python's
+standard library alone.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import os
 import shutil
 import subprocess
 import sys
@@ -20,6 +22,8 @@ import tempfile
 import venv
 from pathlib import Path
 from typing import Any
+
+LAB = Path(__file__).resolve().parents[2] / "lab"
 
 #: What may be installed.
 EXPECTED = {"numpy", "pip", "saccade-vla", "setuptools"}
@@ -37,7 +41,7 @@ import saccade
 
 folder, precision = sys.argv[1:]
 start = time.perf_counter()
-policy = saccade.Policy.load(folder, precision=precision)
+policy = saccade.Policy.from_pretrained(folder, precision=precision)
 loaded = time.perf_counter()
 peak = next(int(line.split()[1]) for line in open("/proc/self/status") if line.startswith("VmHWM:"))
 example = policy.example_observation(seed=0)
@@ -78,7 +82,7 @@ def main() -> int:
         checkpoint = args.checkpoint or folder / "checkpoint"
         if args.checkpoint is None:
             size = ["--small"] if args.small else []
-            run(python, "-I", "-m", "saccade_lab.random_checkpoint", checkpoint, *size)
+            run(python, "-m", "saccade_lab.random_checkpoint", checkpoint, *size, path=LAB)
         failed = False
         print(f"{'':10}{'load, s':>9}{'first, s':>10}{'second, s':>11}{'memory, GB':>12}  chunk")
         for precision in PRECISIONS:
@@ -122,10 +126,18 @@ def problems_of(found: dict[str, Any], precision: str, *, limited: bool) -> list
     return [problem for problem, holds in checks.items() if not holds]
 
 
-def run(*command: str | Path) -> str:
-    """The standard output of a command, without this process's Python settings."""
+def run(*command: str | Path, path: Path | None = None) -> str:
+    """The standard output of a command, which may import from `path`."""
+    environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+    if path is not None:
+        environment["PYTHONPATH"] = str(path)
     done = subprocess.run(
-        list(map(str, command)), stdout=subprocess.PIPE, text=True, check=False, cwd=tempfile.gettempdir()
+        list(map(str, command)),
+        stdout=subprocess.PIPE,
+        text=True,
+        check=False,
+        cwd=tempfile.gettempdir(),
+        env=environment,
     )
     if done.returncode != 0:
         raise SystemExit(f"{' '.join(map(str, command[:4]))} ended with status {done.returncode}")

@@ -34,4 +34,4 @@ def test_without_the_lab_a_command_says_what_to_install(gone: bool, arguments: l
     assert line.startswith(
         f"saccade: {arguments[0]}: needs saccade-vla-lab, which is not installed. Install with: "
     )
-    assert "lab[sim]" in line
+    assert f"lab[{'sim' if arguments == ['rollout'] else 'study'}]" in line

@@ -8,7 +8,7 @@ use saccade::{
 };
 
 fn demo() -> ActionHead {
-    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../python/saccade/sim/demo");
+    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../python/saccade/checkpoints/demo");
     ActionHead::load(&path, &LoadOptions::default().with_num_threads(1)).unwrap()
 }
 

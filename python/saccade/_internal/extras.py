@@ -72,11 +72,7 @@ class Extras:
         included = {name for extra in extras for name in self.includes.get(extra, ())}
         wanted = ",".join(extra for extra in extras if extra not in included)
         packages = [self.modules[self._extra_of(module)][module] for module in modules]
-        return _install(self.folder, wanted, packages)
-
-    def install_lab(self) -> str:
-        """A shell command that installs saccade-vla-lab with what its simulation needs."""
-        return _install("lab", "sim", ["saccade-vla-lab[sim]"])
+        return _install(self.folder, wanted) or pip_install(*packages)
 
     def _missing(self, modules: list[str], extras: list[str]) -> MissingExtraError:
         """The error for these missing modules of these extras."""
@@ -127,11 +123,17 @@ def pip_install(*arguments: str) -> str:
     return " ".join(map(shlex.quote, [*command, *arguments]))
 
 
-def _install(folder: str, extras: str, packages: Sequence[str]) -> str:
-    """A command that installs extras of a folder of the checkout; without a checkout, packages."""
+def install_lab(extra: str) -> str:
+    """How to install saccade-vla-lab, which is on no package index, with an extra."""
+    command = _install("lab", extra)
+    return command or f"{pip_install(f'./lab[{extra}]')} (in a clone of saccade)"
+
+
+def _install(folder: str, extras: str) -> str | None:
+    """A command that installs extras of a folder of the checkout; None without a checkout."""
     checkout = Path(__file__).resolve().parents[3]
     if not ((checkout / "pyproject.toml").is_file() and (checkout / "crates").is_dir()):
-        return pip_install(*packages)
+        return None
     return pip_install("--editable", f"{_shown(checkout / folder)}[{extras}]")
 
 

@@ -48,6 +48,8 @@ LAB_COMMANDS: dict[str, str] = {
     "parity": "compare the Rust head with the torch reference",
     "bench": "time the action head and compare it with the limits of this machine",
 }
+#: Those that need the lab's extra `study`, since they use torch; for the others `sim` is enough.
+NEED_TORCH = ("train", "study", "parity")
 LAB = "saccade-vla-lab"
 ENTRY_POINTS = "saccade.commands"
 
@@ -76,9 +78,9 @@ Lists take commas, spaces or both: --tasks reach,push or --tasks reach push. Bad
 be used and missing packages give one line on standard error and exit status 2.
 
 examples:
-  saccade rollout --help
-  saccade rollout --tasks reach --episodes 2
+  saccade act --help
   saccade inspect checkpoint/
+  saccade serve checkpoint/
 """
 
 
@@ -125,7 +127,7 @@ def load_command(name: str) -> Command:
         try:
             (entry,) = importlib.metadata.distribution(LAB).entry_points.select(group=ENTRY_POINTS, name=name)
         except (importlib.metadata.PackageNotFoundError, ValueError):
-            install = extras.SACCADE.install_lab()
+            install = extras.install_lab("study" if name in NEED_TORCH else "sim")
             raise UsageError(
                 f"{name}: needs {LAB}, which is not installed. Install with: {install}"
             ) from None
