@@ -48,7 +48,10 @@ fn attention_on_vl(trace: &Trace, num_layers: usize, is_cross: impl Fn(usize) ->
 }
 
 fn main() -> Result<()> {
-    let demo = concat!(env!("CARGO_MANIFEST_DIR"), "/../../python/saccade/checkpoints/demo");
+    let demo = concat!(
+        env!("CARGO_MANIFEST_DIR"),
+        "/../../python/saccade/checkpoints/demo"
+    );
     let checkpoint = std::env::args_os()
         .nth(1)
         .map_or_else(|| demo.into(), PathBuf::from);

@@ -20,7 +20,10 @@ fn numbers(len: usize, seed: u32) -> Vec<f32> {
 }
 
 fn main() -> Result<()> {
-    let demo = concat!(env!("CARGO_MANIFEST_DIR"), "/../../python/saccade/checkpoints/demo");
+    let demo = concat!(
+        env!("CARGO_MANIFEST_DIR"),
+        "/../../python/saccade/checkpoints/demo"
+    );
     let checkpoint = std::env::args_os()
         .nth(1)
         .map_or_else(|| demo.into(), PathBuf::from);
