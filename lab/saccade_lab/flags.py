@@ -52,8 +52,8 @@ def add_episodes(parser: Arguments, default: int | None, help: str = "episodes p
 
 
 def add_frames(parser: argparse.ArgumentParser) -> None:
-    """Declares pictures and words for a whole checkpoint; see ``check_frames``."""
-    seen = parser.add_argument_group("pictures and words for a whole checkpoint")
+    """Declares images and an instruction for a whole checkpoint; see ``check_frames``."""
+    seen = parser.add_argument_group("images and an instruction for a whole checkpoint")
     add_pictures(seen, "--frames")
     seen.add_argument(
         "--precision", choices=PRECISIONS, help="of the backbone (default: float32, as the head always)"

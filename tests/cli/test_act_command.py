@@ -75,7 +75,7 @@ def test_it_prints_tables_and_says_what_it_assumed(capsys: pytest.CaptureFixture
     out, err = capsys.readouterr()
     assert "Actions of new_embodiment, in its units" in out
     assert all(part in out for part in PARTS)
-    assert "random frames" in err
+    assert "random images" in err
     assert "a state in the middle of the robot's range" in err
     assert '"pick up the red block"' in err
 

@@ -26,10 +26,10 @@ HELP = "show what the rows of the action head attend to"
 EXTRAS = LAB
 
 EPILOG = """\
-The observation comes from the simulator (--task, --seed, --after), from pictures (--frames) or from a file of
+The observation comes from the simulator (--task, --seed, --after), from images (--frames) or from a file of
 backbone features (--features).
 
-Pictures need a whole checkpoint, with backbone and tokenizer. DIR holds a picture for each camera, named
+Images need a whole checkpoint, with backbone and tokenizer. DIR holds an image of each camera, named
 after it (front.png), and state.json; or a folder of these for each observation, of which --row chooses one.
 Without state.json and --state the state is in the middle of the robot's range. `saccade inspect` lists the
 cameras.
@@ -72,7 +72,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     arguments.add_config(parser)
     arguments.add_seed(
         parser,
-        "seed of the task's layout, words and noise; with pictures or a file without noise, of the noise",
+        "seed of the task's layout, instruction and noise; with images or a file without noise, of the noise",
     )
     arguments.add_integer(parser, "--row", minimum=0, help="which observation, of several (default: 0)")
     simulator = parser.add_argument_group("an observation from the simulator")

@@ -106,7 +106,7 @@ def compute(kind: type[Study], args: argparse.Namespace) -> Path:
 
     workers = workers_of(args)
     with output.progress_bar("loading", transient=True) as loading:
-        args.on_observation = lambda done, total: loading(done, total, "reading the pictures")
+        args.on_observation = lambda done, total: loading(done, total, "reading the images")
         study = kind.from_arguments(args)
     out = writable_directory(args.out)
     with output.progress_bar(kind.name) as update:

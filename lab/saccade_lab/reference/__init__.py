@@ -2,7 +2,7 @@
 
 They favour clarity over speed: nothing is cached, and every row is computed in every block. ``head`` is the
 sampler and the loss, ``layers`` the modules, ``intervene`` the effect of an intervention in each block;
-``backbone`` is what turns frames and words into features. Needs torch and safetensors.
+``backbone`` is what turns images and an instruction into features. Needs torch and safetensors.
 """
 
 from saccade_lab.extras import LAB

@@ -130,7 +130,7 @@ class Encoded:
     Attributes:
         config: Config of the head.
         identity: Name and hash of the checkpoint.
-        preprocessing: How frames and words were prepared.
+        preprocessing: How images and instruction were prepared.
         action_width: Number of the head's action dimensions that the robot uses.
         pictures, others: The observations, and those to compare them with.
         observation, other_observation: The same as the head takes them; None without others.

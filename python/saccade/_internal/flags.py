@@ -196,7 +196,7 @@ def add_preprocessing(parser: Arguments) -> None:
     parser.add_argument(
         "--preprocessing",
         choices=("lerobot", "isaac"),
-        help="the way in which frames and words are prepared (default: by version and layout)",
+        help="how images and instruction are prepared (default: by version and layout)",
     )
     parser.add_argument(
         "--tokenizer", type=Path, metavar="PATH", help="tokenizer.json, or a directory with the tokenizer"
@@ -204,12 +204,12 @@ def add_preprocessing(parser: Arguments) -> None:
 
 
 def add_pictures(parser: Arguments, flag: str) -> None:
-    """Declares a directory of pictures with the given flag, an instruction and a state."""
+    """Declares a directory of images with the given flag, an instruction and a state."""
     parser.add_argument(
         flag,
         type=Path,
         metavar="DIR",
-        help="a picture for each camera, named after it (front.png), or folders of them, one per observation",
+        help="an image of each camera, named after it (front.png), or folders of them, one per observation",
     )
     parser.add_argument("--instruction", metavar="TEXT", help="instruction to the robot")
     parser.add_argument(

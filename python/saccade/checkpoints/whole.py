@@ -50,7 +50,7 @@ class BackboneFindings:
     memory: dict[str, int] = field(default_factory=dict)
     """Size of the loaded weights by precision, in bytes."""
     processor: str | None = None
-    """How frames and words are prepared by default; None if something is missing."""
+    """How images and instruction are prepared by default; None if something is missing."""
     processor_problem: str | None = None
     """What is missing: which files of which published id are needed."""
 

@@ -30,7 +30,7 @@ from saccade.errors import SaccadeError
 # A command is the module of its name in this package. Its line of help is repeated here, so that
 # `saccade --help` imports none of them; a test compares the two.
 COMMANDS: dict[str, str] = {
-    "act": "run a whole checkpoint on pictures and an instruction",
+    "act": "run a whole checkpoint on images and an instruction",
     "serve": "serve a whole checkpoint to robots and simulators over the network",
     "inspect": "show what a checkpoint contains",
     "resize": "write a checkpoint with another number of future tokens",

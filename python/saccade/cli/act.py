@@ -1,4 +1,4 @@
-"""`saccade act`: runs a whole checkpoint on pictures and an instruction, and prints the actions."""
+"""`saccade act`: runs a whole checkpoint on images and an instruction, and prints the actions."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ if TYPE_CHECKING:
     from saccade._internal.arrays import Float32Array
     from saccade.policy.policy import Policy
 
-HELP = "run a whole checkpoint on pictures and an instruction"
+HELP = "run a whole checkpoint on images and an instruction"
 EPILOG = """\
 Prints a chunk of actions in the robot's units, and how long each part took. The checkpoint must hold the
 backbone and the head. `saccade inspect` lists its robots, cameras and states.
 
-Without --image the frames are random, without --state the state is in the middle of the robot's range.
+Without --image the images are random, without --state the state is in the middle of the robot's range.
 
 examples:
   saccade act GR00T-N1.5-3B/ --embodiment gr1 --data-config fourier_gr1_arms_only --image ego_view=table.png
@@ -36,8 +36,8 @@ state.json holds numbers by key, {"single_arm": [0, 0.1, 0, 0, 0], "gripper": [1
 #: The parts that are timed, in order, and what each does.
 PARTS = {
     "load": "checkpoint, tokenizer, statistics",
-    "frames": "reading the pictures",
-    "processor": "resizing frames, making tokens",
+    "frames": "reading the images",
+    "processor": "resizing images, making tokens",
     "backbone": "vision tower and language model",
     "encode": "the head's keys and values",
     "sample": "denoising the actions",
@@ -55,7 +55,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="extend",
         default=[],
         metavar="[CAMERA=]FILE",
-        help="picture of each camera; the name may be left out if there is one camera",
+        help="image of each camera; the name may be left out if there is one camera",
     )
     seen.add_argument("--instruction", metavar="TEXT", help="what to do")
     seen.add_argument("--state", type=Path, metavar="FILE", help="JSON: the robot's state in its own units")
@@ -107,7 +107,7 @@ def run(args: argparse.Namespace) -> int:
         output.print_json(report)
         return EXIT_OK
     assumed = [
-        *(["random frames"] if not pictures else []),
+        *(["random images"] if not pictures else []),
         *(["a state in the middle of the robot's range"] if state is None else []),
         *([f'the instruction "{instruction_of(given)}"'] if args.instruction is None else []),
     ]

@@ -28,7 +28,7 @@ A tensor counts "as initialised" if it is distributed as the released constructo
 last table lists the evidence for and against "this checkpoint was trained from a random start";
 docs/checkpoint-tools.md explains when that happens.
 
-With --precision-check it runs the whole checkpoint instead, at every precision on the same pictures from the
+With --precision-check it runs the whole checkpoint instead, at every precision on the same images from the
 same noise, compares features and actions with float32, and recommends the smallest precision whose actions
 differ by at most 1 % of their range. docs/precision.md says why.
 
@@ -51,7 +51,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--reference", type=Path, metavar="PATH", help="checkpoint to compare with, tensor by tensor"
     )
     arguments.add_json(parser, "print JSON instead of tables")
-    seen = parser.add_argument_group("compare the precisions on pictures and words")
+    seen = parser.add_argument_group("compare the precisions on images and an instruction")
     arguments.add_pictures(seen, "--precision-check")
     arguments.add_preprocessing(seen)
     add_overrides(seen)
@@ -182,7 +182,7 @@ def backbone(found: BackboneFindings) -> Section:
             ["language model", f"{words}, {config.vocab_size:,} tokens"],
             ["width of features", str(config.feature_dim)],
             ["MB in memory", memory],
-            ["frames and words", found.processor or "see below"],
+            ["preprocessing", found.processor or "see below"],
             *([["missing", line(found.processor_problem)]] if found.processor_problem else []),
         ],
     )

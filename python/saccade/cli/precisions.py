@@ -1,4 +1,4 @@
-"""`saccade inspect --precision-check`: compares the precisions of a whole checkpoint on pictures."""
+"""`saccade inspect --precision-check`: compares the precisions of a whole checkpoint on images."""
 
 from __future__ import annotations
 
