@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 
 import saccade
 from saccade.checkpoints import describe
-from saccade.errors import SaccadeError
+from saccade.errors import CheckpointError, SaccadeError
 from tests.helpers import hostile_cases, layouts
 
 # Layouts and the files next to their weights.
@@ -197,3 +197,22 @@ def test_statistics_in_safetensors(
     path.unlink()
     WHOLE[case](path)
     read("lerobot", folder)
+
+
+@pytest.mark.parametrize("layout", ["lerobot", "lerobot-n17"])
+@pytest.mark.parametrize(
+    "path", [("input_features", "observation.state"), ("output_features", "action")], ids=["state", "action"]
+)
+@pytest.mark.parametrize("width", [2**20 + 1, 2**31, 10**400])
+def test_a_feature_is_not_as_wide_as_a_file_likes(
+    layout: str, path: tuple[str, str], width: int, checkpoints: dict[str, Path], tmp_path: Path
+) -> None:
+    folder = tmp_path / layout
+    shutil.copytree(checkpoints[layout], folder)
+    config = json.loads((folder / "config.json").read_text())
+    config[path[0]][path[1]]["shape"] = [width]
+    (folder / "config.json").write_text(json.dumps(config))
+    with pytest.raises(
+        CheckpointError, match=rf"config\.json: {path[0]}: {path[1]}: expected at most 1048576"
+    ):
+        saccade.Normalizer.from_pretrained(folder)

@@ -14,6 +14,9 @@ from saccade.robots.data_configs import DataConfig, says_nothing
 from saccade.robots.embodiments import resolved
 from saccade.robots.groups import Group, Statistics
 
+#: The engine's limit of the width of a head.
+MOST_WIDTH = 1 << 20
+
 #: The statistics that a mode needs. The other modes need none.
 STATISTICS = {
     "min_max": ("min", "max"),
@@ -168,3 +171,11 @@ def width_of(statistics: Any) -> int | None:
 def size_of(value: Any) -> int | None:
     """A positive integer of a file. Any other value is treated as absent."""
     return value if type(value) is int and value > 0 else None
+
+
+def bounded_size(name: str, value: Any) -> int | None:
+    """As :func:`size_of`, of a state or action; a `CheckpointError` beyond :data:`MOST_WIDTH`."""
+    size = size_of(value)
+    if size is not None and size > MOST_WIDTH:
+        raise CheckpointError(f"config.json: {name}: expected at most {MOST_WIDTH}, got {size}")
+    return size

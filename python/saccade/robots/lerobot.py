@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from saccade.robots.building import Builder, Options, size_of, value_at, width_of
+from saccade.robots.building import Builder, Options, bounded_size, size_of, value_at, width_of
 from saccade.robots.embodiments import LEROBOT_N15_IDS, N17_IDS
 from saccade.robots.groups import Group
 from saccade.robots.isaac_processor import (
@@ -56,7 +56,7 @@ def lerobot_robot(folder: Path, preprocessor: Mapping[str, Any], options: Option
     action = _native_groups(builder, pipeline, state) if native else _flat_groups(builder, pipeline)
     width = sum(group.size for group in action)
     # lerobot replaces what N1.5's step says by the width in config.json.
-    said = size_of(giving.get("env_action_dim")) if pipeline.is_n17 else None
+    said = bounded_size("env_action_dim", giving.get("env_action_dim")) if pipeline.is_n17 else None
     cut = min(said or width, pipeline.feature("output_features", ACTION) or width)
     if cut < width:
         action, width = _cut(builder, action, cut), cut
@@ -120,7 +120,7 @@ def _flat_groups(builder: Builder, pipeline: Pipeline) -> tuple[Group, ...]:
     """The action as one group."""
     config, statistics = pipeline.unpack.config, pipeline.unpack.statistics
     found = statistics.get(ACTION)
-    given = size_of(config.get("env_action_dim")) if pipeline.is_n17 else None
+    given = bounded_size("env_action_dim", config.get("env_action_dim")) if pipeline.is_n17 else None
     sizes = [size for size in (pipeline.feature("output_features", ACTION), given) if size is not None]
     size = min(sizes, default=_length(found))
     if size is None:

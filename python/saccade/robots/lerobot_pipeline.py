@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from saccade._internal.small_files import read_json, read_small_tensors
 from saccade.errors import CheckpointError
-from saccade.robots.building import Builder, size_of, value_at
+from saccade.robots.building import Builder, bounded_size, size_of, value_at
 
 PREPROCESSOR, POSTPROCESSOR = "policy_preprocessor.json", "policy_postprocessor.json"
 
@@ -76,7 +76,7 @@ class Pipeline:
     def feature(self, kind: str, name: str) -> int | None:
         """Width of one of ``input_features`` or ``output_features``, or None."""
         shape = value_at(self.config, kind, name, "shape")
-        return size_of(shape[-1]) if isinstance(shape, list) and shape else None
+        return bounded_size(f"{kind}: {name}", shape[-1]) if isinstance(shape, list) and shape else None
 
     def offsets(self, width: int) -> npt.NDArray[np.bool_] | None:
         """True for each number of an action of this width that the state is added to; None if it is to none.

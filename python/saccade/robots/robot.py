@@ -9,13 +9,10 @@ import numpy as np
 import numpy.typing as npt
 
 from saccade.errors import CheckpointError, InputError
-from saccade.robots.building import Options
+from saccade.robots.building import MOST_WIDTH, Options
 from saccade.robots.data_configs import DataConfig
 from saccade.robots.groups import Group
 from saccade.robots.lerobot_pipeline import Pipeline
-
-#: The engine's limit of the width of a head.
-MOST_WIDTH = 1 << 20
 
 #: The widths of state and action that a file says the head has.
 Dims = tuple[int | None, int | None]
