@@ -24,13 +24,13 @@ class Job:
     parsed: ParsedObservation
     client: Any
     frames: Sequence[bytes] = ()  # before the request, which are sent back before the answer
-    is_msgpack_numpy: bool = False  # the form in which its arrays came, and those of the answer go
+    is_msgpack_numpy: bool = False  # the format in which its arrays came, and those of the answer go
     num_bytes: int = 0
     received: float = field(default_factory=time.perf_counter)
     is_claimed: bool = False  # a thread has begun to prepare it while it waits
     inputs: Sequence[Any] = ()  # what the backbone takes, once it is prepared
     actions: Any = None
-    info: Mapping[str, Any] = field(default_factory=dict)  # what is told besides the actions
+    info: Mapping[str, Any] = field(default_factory=dict)  # what is returned with the actions
     batch: int = 0  # number of observations that were computed together
     error: BaseException | None = None  # why there are no actions
     milliseconds: dict[str, float] = field(default_factory=dict)  # by part

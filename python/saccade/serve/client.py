@@ -20,7 +20,7 @@ class ServerError(SaccadeError, RuntimeError):
 
 
 class Client:
-    """Asks a server for actions, in the wire form of GR00T N1.7.
+    """Asks a server for actions, in the wire format of GR00T N1.7.
 
     Args:
         host: Name or address of the server.
@@ -67,7 +67,7 @@ class Client:
         """The actions for an observation.
 
         Args:
-            observation: In one of the forms that :meth:`saccade.Policy.act` takes.
+            observation: In one of the formats that :meth:`saccade.Policy.act` takes.
             options: ``{"seed": 5}`` for actions that can be repeated, ``{"num_steps": 2}`` for another number
                 of Euler steps. ``{"session": name, "executed": steps}`` to continue the session's last
                 chunk, of which the robot has executed ``steps`` actions. ``docs/serve.md`` lists all.

@@ -171,13 +171,13 @@ def _timed(jobs: Sequence[Job], part: str) -> Iterator[None]:
 
 
 def _horizon(actions: Any) -> int:
-    """Number of actions in a chunk of any form."""
+    """Number of actions in a chunk in any format."""
     array = next(iter(actions.values())) if isinstance(actions, Mapping) else actions
     return int(array.shape[-2])
 
 
 def _info(work: _Work) -> dict[str, Any]:
-    """What N1.6's and N1.7's clients are told besides the actions."""
+    """What is returned with the actions to N1.6's and N1.7's clients."""
     options = work.job.call.options
     applied = dict(options.stated)
     if work.continued is None:

@@ -27,7 +27,7 @@ REFUSAL = (
 
 
 class Message(NamedTuple):
-    """An unpacked message, and whether it has arrays in the form of the package msgpack-numpy."""
+    """An unpacked message, and whether it has arrays in the format of the package msgpack-numpy."""
 
     value: Any
     is_msgpack_numpy: bool
@@ -123,7 +123,7 @@ def is_pickle(data: Bytes) -> bool:
 
 
 def refusal(data: Bytes) -> bytes:
-    """The error for a client that sent a pickle, in a form that it can read.
+    """The error for a client that sent a pickle, in a format that it can read.
 
     A client that uses ``torch.save`` gets what ``torch.load`` reads, so that its user sees the message.
     """

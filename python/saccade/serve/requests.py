@@ -1,7 +1,7 @@
-"""What a request asks for, in each of the released wire forms, and the answers in the same form.
+"""What a request asks for, in each of the released wire formats, and the answers in the same one.
 
 GR00T N1.5 sends the observation itself as `data`, and gets the actions. N1.6 and N1.7 send `observation` and
-`options`, and get `[actions, info]`. N1.7's arrays are in another form than the others'; see `npy`.
+`options`, and get `[actions, info]`. N1.7's arrays have another format than the others'; see `npy`.
 """
 
 from __future__ import annotations
