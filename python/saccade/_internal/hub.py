@@ -13,7 +13,7 @@ from pathlib import Path
 
 from saccade._internal import hub_cache
 from saccade._internal.hub_download import Offline, download, list_files, neighbour
-from saccade._internal.hub_files import WHOLE, absent_files, missing_files
+from saccade._internal.hub_files import POLICY, absent_files, missing_files
 from saccade._internal.warning import warn
 from saccade.errors import InputError
 
@@ -28,8 +28,8 @@ DEFAULT_REVISION = "main"
 
 
 @dataclass(frozen=True)
-class Location:
-    """Where the files of a checkpoint are."""
+class Location(os.PathLike[str]):
+    """Where the files of a checkpoint are. As an argument it is the path, which is known to be complete."""
 
     path: Path
     """A file or a directory. For an id, the directory of one commit in the local cache."""
@@ -38,12 +38,15 @@ class Location:
     commit: str | None = None
     """The commit that ``revision`` named when it was resolved; None for a local path."""
 
+    def __fspath__(self) -> str:
+        return os.fspath(self.path)
+
 
 def resolve(
     id_or_path: str | os.PathLike[str],
     revision: str | None = None,
     *,
-    files: tuple[str, ...] = WHOLE,
+    files: tuple[str, ...] = POLICY,
     argument: str = "id_or_path",
 ) -> Path:
     """The path of a checkpoint, which is downloaded if it is the id of a published one.
@@ -77,10 +80,12 @@ def locate(
     id_or_path: str | os.PathLike[str],
     revision: str | None = None,
     *,
-    files: tuple[str, ...] = WHOLE,
+    files: tuple[str, ...] = POLICY,
     argument: str = "id_or_path",
 ) -> Location:
     """As :func:`resolve`, with the id and the commit that the path belongs to."""
+    if isinstance(id_or_path, Location):
+        return id_or_path
     text = _text(id_or_path, argument)
     if revision is not None:
         _check_revision(revision)
@@ -113,7 +118,7 @@ def parse(text: str) -> tuple[str, str | None] | None:
 
 
 def locate_published(
-    name: str, revision: str | None = None, *, files: tuple[str, ...] = WHOLE, argument: str = "id_or_path"
+    name: str, revision: str | None = None, *, files: tuple[str, ...] = POLICY, argument: str = "id_or_path"
 ) -> Location:
     """As :func:`locate` for an id, whatever exists under this name on this machine.
 
@@ -142,6 +147,11 @@ def locate_published(
     hub_cache.write_listing(folder, listed)
     hub_cache.write_revision(name, revision, commit)
     return Location(folder, name, commit)
+
+
+def commit_of(path: Path) -> str | None:
+    """The commit of the repository whose folder in the cache ``path`` is; None for other paths."""
+    return path.name if path.parent.name == "snapshots" and COMMIT.fullmatch(path.name) else None
 
 
 def _from_cache(
@@ -173,7 +183,7 @@ def _from_cache(
 
 def _check_cached_folder(path: Path, files: tuple[str, ...], argument: str) -> None:
     """Checks a path that is the folder of a commit in the cache, where files may be missing."""
-    listed = hub_cache.read_listing(path) if path.parent.name == "snapshots" else None
+    listed = hub_cache.read_listing(path) if commit_of(path) else None
     missing = [] if listed is None else missing_files(path, files, listed)
     if missing:
         raise FileNotFoundError(

@@ -55,8 +55,10 @@ PROCESSOR = (
     "processor/processor_config.json",
     "policy_*processor*.json",
 )
-#: Everything that saccade reads, and what belongs to a checkpoint that is rewritten.
-WHOLE = (*dict.fromkeys((*HEAD, *PROCESSOR, "*.json", "*.txt", "*.jinja", "*.md", "LICENSE*")),)
+#: Everything that saccade reads: head, backbone, processor, tokenizer and statistics.
+POLICY = (*dict.fromkeys((*HEAD, *PROCESSOR)),)
+#: With what belongs to a checkpoint that is rewritten.
+WHOLE = (*dict.fromkeys((*POLICY, "*.json", "*.txt", "*.jinja", "*.md", "LICENSE*")),)
 
 
 def wanted(files: tuple[str, ...], names: Iterable[str]) -> list[str]:

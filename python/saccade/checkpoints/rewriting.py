@@ -12,6 +12,7 @@ import saccade._saccade as _saccade
 from saccade._internal.arrays import integer, optional_integers, text
 from saccade._internal.files import sha256_of
 from saccade._internal.hub import resolve
+from saccade._internal.hub_files import WHOLE
 from saccade.checkpoints.description import Config, Source
 from saccade.errors import InputError
 from saccade.head.config import to_json
@@ -279,7 +280,7 @@ def _rewrite(
     adapter: Path | None = None,
 ) -> dict[str, Any]:
     """The arguments that the three functions share, for the engine."""
-    path = resolve(source)
+    path = resolve(source, files=WHOLE)
     config_text = None if config is None else to_json(config)
     published = _saccade.Published.open_base(
         os.fspath(path), config_text, None if adapter is None else os.fspath(adapter)

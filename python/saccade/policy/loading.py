@@ -10,7 +10,7 @@ from typing import Any
 
 import saccade._saccade as _saccade
 from saccade._internal.arrays import integer
-from saccade._internal.hub import resolve
+from saccade._internal.hub import locate
 from saccade.backbone.backbone import Backbone
 from saccade.errors import CheckpointError, InputError
 from saccade.head.config import HeadConfig
@@ -47,7 +47,8 @@ def load_parts(
     What is quick to load comes first, so that a mistake is found before gigabytes are read.
     """
     precisions = precisions_of_parts(precision)
-    path = resolve(id_or_path, revision)
+    location = locate(id_or_path, revision)
+    path = location.path
     check_whole(path)
     config = HeadConfig(**_saccade.Published.open(os.fspath(path), None).config())
     statistics = read_normalizer(path if normalizer is None else normalizer, embodiment, data_config, config)
@@ -61,9 +62,9 @@ def load_parts(
     )
     embodiment_id = requested_id(statistics, embodiment)
     # The larger part first: what loading needs for a while then adds to less.
-    backbone = Backbone.from_pretrained(path, precision=precisions["backbone"], num_threads=num_threads)
+    backbone = Backbone.from_pretrained(location, precision=precisions["backbone"], num_threads=num_threads)
     head = ActionHead.from_pretrained(
-        path,
+        location,
         embodiment_ids=None if embodiment_id is None else [embodiment_id],
         action_horizon=horizon,
         # N1.7 takes as many states as its config says; the policy checks that the robot has as many.
