@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 from collections.abc import Iterator
 from pathlib import Path
@@ -15,7 +16,7 @@ from tests.helpers.hub_server import Hub, Repository, files_of, run
 NAME = "nvidia/GR00T-N1.5-3B"
 RESOLVE = f"""
 from saccade._internal import hub, hub_files
-def resolve(name={NAME!r}, revision=None, files=hub_files.WHOLE):
+def resolve(name={NAME!r}, revision=None, files=hub_files.POLICY):
     try:
         print("found", hub.resolve(name, revision, files=files))
     except OSError as error:
@@ -28,6 +29,8 @@ UNREAD = {
     "global_step10/optimizer.pt": b"state",
     "checkpoint-10/model.safetensors": b"other weights",
 }
+#: Those that a rewritten checkpoint keeps.
+KEPT = {"README.md": b"[6]", "LICENSE": b"[7]", "chat_template.jinja": b"[8]", "train_config.json": b"[9]"}
 # No two with the same content: huggingface_hub would download one of them only.
 STATISTICS = {"processor/statistics.json": b"[1]", "embodiment_id.json": b"[2]"}
 TOKENIZER = {"tokenizer.json": b"[3]", "merges.txt": b"[4]", "tokenizer/vocab.json": b"[5]"}
@@ -43,7 +46,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
 def hub(files: dict[str, bytes]) -> Iterator[Hub]:
     server = Hub()
     repository = server.repositories[NAME] = Repository()
-    repository.commit(files | UNREAD | STATISTICS | TOKENIZER)
+    repository.commit(files | UNREAD | KEPT | STATISTICS | TOKENIZER)
     yield server
     server.close()
 
@@ -67,6 +70,9 @@ def test_only_what_is_read_is_downloaded(hub: Hub, files: dict[str, bytes], tmp_
     hub.requests.clear()
     assert found(run(f"{RESOLVE}\nresolve()", hub.endpoint, tmp_path)) == folder
     assert [path for _, path in hub.requests] == [f"/api/models/{NAME}/revision/main"]
+    hub.requests.clear()
+    assert found(run(f"{RESOLVE}\nresolve(files=hub_files.WHOLE)", hub.endpoint, tmp_path)) == folder
+    assert hub.downloaded() == sorted(KEPT)
 
 
 def test_a_head_is_loaded_by_its_id_and_pickled_with_its_commit(
@@ -93,6 +99,31 @@ def test_a_head_is_loaded_by_its_id_and_pickled_with_its_commit(
     source, config = again.stdout.strip().splitlines()
     assert source.endswith(first)
     assert config == str(saccade.ActionHead.from_pretrained(folder, embodiment_ids=[24]).config)
+
+
+def test_a_policy_is_loaded_by_its_id_and_served_with_its_commit(hub: Hub, tmp_path: Path) -> None:
+    pytest.importorskip("zmq")
+    first = hub.repositories[NAME].commit(files_of(Path(saccade.demo_checkpoint())) | KEPT)
+    load = (
+        "import pickle, saccade\n"
+        "from saccade.serve import Server, bind, open_log\n"
+        f"policy = saccade.Policy.from_pretrained({NAME!r})\n"
+        "open('parts.pickle', 'wb').write(pickle.dumps((policy.head, policy.backbone)))\n"
+        "log = open_log('json')\n"
+        "server = Server(policy, bind('127.0.0.1', 0), log)\n"
+        "server.stop('test')\n"
+        "server.run()\n"
+        "log.close()"
+    )
+    result = run(load, hub.endpoint, tmp_path)
+    assert json.loads(result.stdout.splitlines()[0])["commit"] == first, result.stderr
+    assert not KEPT.keys() & set(hub.downloaded())
+    hub.repositories[NAME].commit({"config.json": b"damaged", "model.safetensors": b""})
+    pickled = (tmp_path / "parts.pickle").read_bytes()
+    assert str(tmp_path).encode() not in pickled  # it is loaded on another machine too
+    show = "import pickle\nfor part in pickle.load(open('parts.pickle', 'rb')): print(part.source)"
+    sources = run(show, hub.endpoint, tmp_path).stdout.split()
+    assert [Path(source).name for source in sources] == [first, first]
 
 
 def test_statistics_need_no_weights(hub: Hub, tmp_path: Path) -> None:

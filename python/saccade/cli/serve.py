@@ -4,16 +4,11 @@ from __future__ import annotations
 
 import argparse
 import os
-import sys
-from typing import TYPE_CHECKING
 
 from saccade._internal import flags as arguments
 from saccade._internal.flags import UsageError, add_policy_options, policy_options
 from saccade.cli import EXIT_INTERRUPTED, EXIT_OK, require
 from saccade.serve.limits import Limits
-
-if TYPE_CHECKING:
-    from saccade.serve.logs import Log
 
 HELP = "serve a whole checkpoint to robots and simulators over the network"
 
@@ -114,9 +109,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     served.add_argument(
         "--modality-form",
         choices=("text", "map"),
-        help="how get_modality_config is answered, which all releases request alike: as clients of N1.5 read "
-        "it (text), or those of N1.6 and N1.7 (map) (default: as for the client's last request, else the "
-        "checkpoint's release)",
+        help="how get_modality_config is answered, for which all releases send the same request: as clients "
+        "of N1.5 read it (text), or those of N1.6 and N1.7 (map) (default: as for the client's last request, "
+        "else the checkpoint's release)",
     )
     served.add_argument(
         "--log",
@@ -154,16 +149,14 @@ def run(args: argparse.Namespace) -> int:
         raise UsageError("--client-keys: expected --secret-key with it, got none")
     require("serve")
     from saccade.policy.policy import Policy
-    from saccade.serve import Server
-    from saccade.serve.keys import read_server_keys
-    from saccade.serve.transport import bind
+    from saccade.serve import Server, bind, open_log, read_server_keys
 
     keys = None if args.secret_key is None else read_server_keys(args.secret_key, args.client_keys)
     listener = bind(args.host, args.port)  # before minutes may be spent on loading
     policy = Policy.from_pretrained(args.checkpoint, **policy_options(args))
     # What a first call sets up is not left to the first client.
     policy.act(policy.example_observation(), seed=0, num_steps=args.num_steps)
-    log = make_log(args.log)
+    log = open_log(args.log)
     try:
         server = Server(
             policy,
@@ -184,15 +177,6 @@ def run(args: argparse.Namespace) -> int:
     finally:
         log.close()
     return EXIT_INTERRUPTED if stopped_by == "SIGINT" else EXIT_OK
-
-
-def make_log(form: str) -> Log:
-    """The log: JSON lines, or text, which is live on a terminal."""
-    from saccade.serve import logs
-
-    if form == "json":
-        return logs.JsonLog(1)
-    return logs.LiveLog(2) if sys.stderr.isatty() else logs.TextLog(2)
 
 
 def limits_of(args: argparse.Namespace) -> Limits:

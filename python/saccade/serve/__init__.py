@@ -14,9 +14,12 @@ from saccade.serve.limits import Limits
 
 if TYPE_CHECKING:
     from saccade.serve.client import Client, ServerError
+    from saccade.serve.keys import read_server_keys
+    from saccade.serve.logs import open_log
     from saccade.serve.server import Server
+    from saccade.serve.transport import bind
 
-__all__ = ["Client", "Limits", "Server", "ServerError"]
+__all__ = ["Client", "Limits", "Server", "ServerError", "bind", "open_log", "read_server_keys"]
 
 # The limits are also shown by `saccade serve --help`, which needs no optional packages.
 if not TYPE_CHECKING:
@@ -25,7 +28,7 @@ if not TYPE_CHECKING:
         if name not in __all__:
             raise AttributeError(f"module 'saccade.serve' has no attribute {name!r}")
         SACCADE.require("zmq", "msgpack")
-        from saccade.serve.client import Client, ServerError
-        from saccade.serve.server import Server
+        from saccade.serve import client, keys, logs, server, transport
 
-        return {"Client": Client, "Server": Server, "ServerError": ServerError}[name]
+        module = {"Server": server, "bind": transport, "open_log": logs, "read_server_keys": keys}
+        return getattr(module.get(name, client), name)

@@ -11,6 +11,7 @@ import logging.handlers
 import os
 import queue
 import shutil
+import sys
 import time
 from collections import Counter, deque
 from collections.abc import Mapping
@@ -19,7 +20,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from saccade._internal.json import dumps
-from saccade.errors import printable
+from saccade.errors import InputError, printable
 from saccade.serve.engine import PARTS
 
 #: Lines that wait to be written; more are lost, and counted.
@@ -106,6 +107,23 @@ class Log(Protocol):
 
     def close(self) -> None:
         """Writes what waits, if that is possible."""
+
+
+def open_log(format: str = "text") -> Log:
+    """Opens the log of a server; close it with its ``close()`` when the server has ended.
+
+    Args:
+        format: ``"json"`` for JSON lines on standard output, or ``"text"`` for lines on standard error, of
+            which one is live on a terminal.
+
+    Raises:
+        InputError: ``format`` is neither.
+    """
+    if format not in ("text", "json"):
+        raise InputError(f"format: expected text or json, got {format!r}")
+    if format == "json":
+        return JsonLog(1)
+    return LiveLog(2) if sys.stderr.isatty() else TextLog(2)
 
 
 class Writer(logging.handlers.QueueListener):
@@ -213,7 +231,8 @@ class TextLog(Writer):
             text += str(fields["message"])
             text += f" (and {fields['left_out']} more)" if "left_out" in fields else ""
         elif name == "listening":
-            text = f"listening on {fields['address']} ({fields['policy']})"
+            commit = f", commit {fields['commit']}" if fields.get("commit") else ""
+            text = f"listening on {fields['address']} ({fields['policy']}{commit})"
         else:
             details = ", ".join(f"{key} {value}" for key, value in fields.items())
             text = f"{name}: {details}" if details else name

@@ -1,14 +1,14 @@
 """The answer to `get_modality_config`: keys and steps of cameras, states, actions and words.
 
-All releases ask for it alike, and read it differently: N1.5 wants each `ModalityConfig` as JSON text with
-prefixed keys (``video.front``), N1.6 and N1.7 want a map with plain keys.
+All releases send the same request, and read the answer differently: N1.5 wants each `ModalityConfig` as JSON
+text with prefixed keys (``video.front``), N1.6 and N1.7 want a map with plain keys.
 """
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from saccade._internal import hub
 from saccade._internal.json import dumps
 from saccade._internal.small_files import read_json
 from saccade.errors import CheckpointError
@@ -24,12 +24,12 @@ Configs = dict[str, dict[str, Any]]
 
 
 def form_of(version: str) -> str:
-    """The form that the released clients of a version of :class:`saccade.HeadConfig` read."""
+    """The format that the released clients of a version of :class:`saccade.HeadConfig` read."""
     return "text" if version in ("n1", "n1.5") else "map"
 
 
 def answers(policy: Policy) -> dict[str, Any]:
-    """The answer in both forms: as ``"text"`` for N1.5, and as ``"map"`` for N1.6 and later.
+    """The answer in both formats: as ``"text"`` for N1.5, and as ``"map"`` for N1.6 and later.
 
     Raises:
         CheckpointError: A file of the checkpoint is damaged.
@@ -52,7 +52,7 @@ def _of_checkpoint(policy: Policy) -> Configs | None:
     source, embodiment = policy.head.source, policy.requirements.embodiment
     if source is None or embodiment is None:
         return None
-    path = processor_folder(hub.resolve(source)) / "processor_config.json"
+    path = processor_folder(Path(source)) / "processor_config.json"
     if not path.is_file():
         return None
     values = read_json(path)

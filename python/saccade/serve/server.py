@@ -13,7 +13,7 @@ from types import FrameType
 from typing import TYPE_CHECKING, Any
 
 import saccade.observations as observations
-from saccade._internal import hub
+from saccade._internal.hub import commit_of
 from saccade.errors import InputError, SaccadeError, printable
 from saccade.serve import modalities
 from saccade.serve.batching import Job, Queue
@@ -48,10 +48,10 @@ class Server:
 
     Args:
         policy: The policy.
-        listener: The socket that clients will connect to, from :func:`saccade.serve.transport.bind`.
-        log: Where it says what happens.
+        listener: The socket that clients will connect to, from :func:`saccade.serve.bind`.
+        log: Where it says what happens, from :func:`saccade.serve.open_log`.
         limits: Its limits.
-        keys: Keys for encryption, from :func:`saccade.serve.keys.read_server_keys`, or None for none.
+        keys: Keys for encryption, from :func:`saccade.serve.read_server_keys`, or None for none.
         max_batch: Observations that are computed at a time: together, or with a small policy in a batch for
             each thread.
         max_wait_ms: Time that a request waits for others at most, in milliseconds.
@@ -69,6 +69,18 @@ class Server:
     Raises:
         CheckpointError: A file of the checkpoint is damaged.
         InputError: ``num_steps`` is out of range.
+
+    Example:
+        >>> import saccade
+        >>> from saccade.serve import Server, bind, open_log
+        >>> def serve(policy: saccade.Policy) -> None:
+        ...     log = open_log()
+        ...     try:
+        ...         server = Server(policy, bind("127.0.0.1", 5555), log)
+        ...         server.stop_on_signals()
+        ...         server.run()
+        ...     finally:
+        ...         log.close()
     """
 
     def __init__(
@@ -104,7 +116,7 @@ class Server:
         self._finished: deque[tuple[Job, bytes]] = deque()
         self._stopping: str | None = None
         source = policy.head.source
-        self._folder = None if source is None else hub.resolve(source)
+        self._folder = None if source is None else Path(source)
         self._stamps = _stamps(self._folder)
         self._workers = [
             threading.Thread(target=self._compute, name=f"saccade-serve-{number}", daemon=True)
@@ -141,7 +153,9 @@ class Server:
             OSError: Another program took the address.
         """
         self._transport.listen()
-        self._log.event("listening", address=self.address, policy=repr(self._policy), pid=os.getpid())
+        commit = None if self._folder is None else commit_of(self._folder)
+        about = {"policy": repr(self._policy), "commit": commit, "pid": os.getpid()}
+        self._log.event("listening", address=self.address, **about)
         for worker in self._workers:
             worker.start()
         self._spoken = self._watched = time.monotonic()
