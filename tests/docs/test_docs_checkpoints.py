@@ -28,6 +28,32 @@ CHECKPOINTS = {
     "my-fork": "fork",
 }
 
+#: What the Python blocks of a page begin with. lerobot's policy needs packages and a backbone that the tests
+#: do not have: its class is replaced by one that holds lerobot's own head, small, with random weights.
+FIRST = {
+    "lerobot": """\
+import sys, types
+import torch
+from saccade_lab.reference import lerobot_head
+from saccade_lab.reference.random_weights import small_config
+
+HEAD = lerobot_head.build(small_config())
+
+class GrootPolicy(torch.nn.Module):
+    @classmethod
+    def from_pretrained(cls, name):
+        policy = cls()
+        policy._groot_model = torch.nn.Module()
+        policy._groot_model.action_head = HEAD
+        return policy
+
+name = "lerobot.policies.groot.modeling_groot"
+for end in (7, 16, 22, None):  # the module and the packages that it is in
+    sys.modules[name[:end]] = types.ModuleType(name[:end])
+sys.modules[name].GrootPolicy = GrootPolicy
+""",
+}
+
 
 def commands(page: Path) -> list[list[str]]:
     """The commands of a page, from top to bottom.
@@ -36,7 +62,7 @@ def commands(page: Path) -> list[list[str]]:
     earlier Python blocks.
     """
     found: list[list[str]] = []
-    program = ""
+    program = FIRST.get(page.stem, "")
     for language, text in re.findall(
         r"^```(bash|python)\n(.*?)^```", page.read_text(), re.MULTILINE | re.DOTALL
     ):

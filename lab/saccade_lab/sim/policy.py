@@ -65,7 +65,7 @@ class Chunk:
 
     Attributes:
         actions: ``(horizon, action_dim)`` float32 in [-1, 1].
-        milliseconds: Time of each part: backbone (with the preparation of images and instruction), encode, sample.
+        milliseconds: Time of each part: backbone (with preprocessing), encode, sample.
     """
 
     actions: Float32Array

@@ -143,7 +143,7 @@ class PolicyConfig:
         )
 
     def processor(self) -> Processor:
-        """What prepares images and instruction, the same that :meth:`saccade.Policy.from_pretrained` finds."""
+        """What prepares images and instruction, as found by :meth:`saccade.Policy.from_pretrained`."""
         vision = self.backbone["vision_config"]
         merged = 2 * vision["patch_size"]
         with tempfile.TemporaryDirectory() as folder:
