@@ -4,7 +4,7 @@
 
 The floor of a part is the longer of two times: its multiply-adds at the CPU's peak rate in the arithmetic of
 the part, and reading its weights at the memory's bandwidth. The expected time divides the floor by the share
-of it that the kernels reach, as measured on a Zen 4, a Zen 5, and on Xeons with AMX and without.
+of it that the kernels reach, as measured on a Zen 5 and on a Xeon with AMX.
 """
 
 from __future__ import annotations
@@ -69,37 +69,14 @@ class Measured:
 
 
 #: By `saccade bench --version n1.5 --profile --num-threads 2` on 2 cores (AVX-512 with its bfloat16 and int8
-#: dot products; 114, 227, 450 GMAC/s, 32 GB/s), T_vl 296, medians of 5. The later record
-#: `benches/peers/results/zen-4.json` is within 15 % of the expected times, and within 10 % with AVX2.
-ZEN_4 = Measured(
-    "a Zen 4 with AVX-512",
-    {
-        "float32": Efficiency(few_rows=0.88, many_rows=0.86, attention=0.45, rest=0.02),
-        "bfloat16": Efficiency(few_rows=0.88, many_rows=0.88, attention=0.45, rest=0.04),
-        "int8": Efficiency(few_rows=0.84, many_rows=0.88, attention=0.45, rest=0.07),
-    },
-)
-
-#: By the same command on 2 cores (AVX-512; 248, 468, 1000 GMAC/s, 47 GB/s), medians of 5, float32 of 3. The
-#: record `benches/peers/results/zen-5.json` is within 15 % of the expected times, with AVX2 too.
+#: dot products; 248, 468, 1000 GMAC/s, 47 GB/s), T_vl 296, medians of 5, float32 of 3. The record
+#: `benches/peers/results/zen-5.json` is within 15 % of the expected times, with AVX2 too.
 ZEN_5 = Measured(
     "a Zen 5 with AVX-512",
     {
         "float32": Efficiency(few_rows=0.91, many_rows=0.92, attention=0.45, rest=0.015),
         "bfloat16": Efficiency(few_rows=0.965, many_rows=0.99, attention=0.42, rest=0.02),
         "int8": Efficiency(few_rows=0.83, many_rows=0.89, attention=0.51, rest=0.03),
-    },
-)
-
-#: From `benches/peers/results/emerald-rapids.json` (2 cores, AVX-512 without AMX); attention and the rest
-#: from one run of `saccade bench --version n1.5 --profile`. The record is within 15 % of the expected times,
-#: but for int8 with AVX2, which takes 0.81 (`sample`) and 0.87 of them.
-EMERALD_RAPIDS = Measured(
-    "a Xeon without AMX",
-    {
-        "float32": Efficiency(few_rows=0.82, many_rows=0.85, attention=0.46, rest=0.01),
-        "bfloat16": Efficiency(few_rows=0.81, many_rows=0.83, attention=0.47, rest=0.015),
-        "int8": Efficiency(few_rows=0.76, many_rows=0.85, attention=0.485, rest=0.04),
     },
 )
 
@@ -116,20 +93,11 @@ XEON_AMX = Measured(
 )
 
 
-#: By the name of the family, where it has no AMX or a hypervisor hides it.
-WITHOUT_TILES = {
-    "Zen 5": ZEN_5,
-    **dict.fromkeys(("Sapphire Rapids", "Emerald Rapids", "Granite Rapids"), EMERALD_RAPIDS),
-}
-
-
 def measured_like(machine: Machine) -> Measured:
-    """The measured CPU that is nearest to a machine. Most were not measured: without AMX, every CPU but a
-    Zen 5 and a Xeon of Emerald Rapids' kind counts as a Zen 4.
+    """The measured CPU that is nearest to a machine. Most were not measured: without AMX, every CPU counts as
+    a Zen 5.
     """
-    if machine.isa == "amx":
-        return XEON_AMX
-    return WITHOUT_TILES.get(machine.family, ZEN_4)
+    return XEON_AMX if machine.isa == "amx" else ZEN_5
 
 
 def floor_of(machine: Machine, precision: str, part: str, work: Work) -> float:

@@ -201,7 +201,7 @@ def test_the_model_grows_with_the_work() -> None:
 
 
 def test_the_model_expects_less_of_tiles() -> None:
-    """AMX is expected to come less near to its floor; a CPU that was not measured counts as a Zen 4."""
+    """AMX is expected to come less near to its floor; a CPU that was not measured counts as a Zen 5."""
     config = n15()
     call = Call.of(config, 296)
     tiles = replace(MACHINE, isa="amx")
@@ -212,10 +212,7 @@ def test_the_model_expects_less_of_tiles() -> None:
         )
     assert measured_like(replace(MACHINE, isa="amx", family="Granite Rapids")).cpu == "a Xeon with AMX"
     others = [replace(MACHINE, isa=isa) for isa in ("avx512", "avx2", "bf16")]
-    assert {measured_like(each).cpu for each in others} == {"a Zen 4 with AVX-512"}
-    assert measured_like(replace(MACHINE, isa="avx2", family="Zen 5")).cpu == "a Zen 5 with AVX-512"
-    hidden = replace(MACHINE, isa="avx512", family="Sapphire Rapids")
-    assert measured_like(hidden).cpu == "a Xeon without AMX"
+    assert {measured_like(each).cpu for each in others} == {"a Zen 5 with AVX-512"}
 
 
 # The roofline
