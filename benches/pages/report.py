@@ -19,14 +19,15 @@ def require_commit(measured: Any, record: Path) -> None:
 
     Args:
         measured: JSON value with a `commit` in each description of a machine, as `git describe --dirty`
-            prints it.
+            prints it,
+            or a version of `saccade` as tables of studies name it.
         record: Its file, for the message.
 
     Raises:
-        UncommittedError: A commit ends with `-dirty`.
+        UncommittedError: One of them ends with `-dirty` or `.changed`.
     """
     for commit in _commits(measured):
-        if commit.endswith("-dirty"):
+        if commit.endswith(("-dirty", ".changed")):
             raise UncommittedError(
                 f"{record}: measured at {commit}, with uncommitted changes; commit them and measure again"
             )
@@ -35,7 +36,7 @@ def require_commit(measured: Any, record: Path) -> None:
 def _commits(value: Any) -> Iterator[str]:
     if isinstance(value, dict):
         for key, each in value.items():
-            if key == "commit":
+            if key in ("commit", "saccade"):
                 yield str(each)
             else:
                 yield from _commits(each)

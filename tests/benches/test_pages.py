@@ -32,6 +32,12 @@ def test_a_record_of_a_tree_with_uncommitted_changes_is_refused(tmp_path: Path) 
     assert page.exists()
 
 
+@pytest.mark.parametrize("version", [{"commit": "4567def-dirty"}, {"saccade": "0.1.0+g4567def.changed"}])
+def test_both_ways_to_name_a_changed_tree_are_known(version: dict[str, str]) -> None:
+    with pytest.raises(UncommittedError, match="4567def"):
+        require_commit({"runs": [{"machine": version}]}, Path("record.json"))
+
+
 def test_peers_write_no_page_of_such_a_record(tmp_path: Path) -> None:
     data = json.loads((RECORDS / "zen-5.json").read_text())
     data["machine"]["commit"] += "-dirty"

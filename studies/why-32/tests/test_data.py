@@ -17,7 +17,8 @@ from saccade.errors import InputError
 from saccade_lab.files import checkpoint_identity
 from saccade_lab.study.cell import Cell
 from saccade_lab.study.table import read_study, read_table
-from why_32.__main__ import main
+from why_32.__main__ import ALLOW_CHANGED, main
+from why_32.report import require_commits
 from why_32.results import confirmed, judged
 from why_32.study import Answer
 
@@ -44,6 +45,12 @@ def test_the_report_is_what_its_command_writes(tmp_path: Path, capsys: pytest.Ca
     assert (tmp_path / "report.md").read_text() == (STUDY / "report.md").read_text()
     figures = [{path.name for path in (folder / "figures").iterdir()} for folder in (tmp_path, STUDY)]
     assert figures[0] == figures[1]
+
+
+def test_rows_of_uncommitted_changes_are_refused_unless_their_stage_is_disclosed(table: pd.DataFrame) -> None:
+    require_commits(table, allow_changed=ALLOW_CHANGED)
+    with pytest.raises(InputError, match="uncommitted changes: two-cameras; expected at most none"):
+        require_commits(table, allow_changed=())
 
 
 def test_a_table_without_the_whole_core_has_no_report(table: pd.DataFrame) -> None:

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import re
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
+
 from saccade._internal.files import write_atomically
+from saccade.errors import InputError
 from saccade_lab.study.page import SavedPicture
 from saccade_lab.study.report import draw
 from saccade_lab.study.section import Grid, Prose, Section, templates
@@ -41,6 +44,26 @@ class Answered(Section):
 def prose(name: str, **values: Any) -> Prose:
     """The text of a template of this study."""
     return Prose(name, package=PACKAGE, **values)
+
+
+def require_commits(table: pd.DataFrame, *, allow_changed: Collection[str]) -> None:
+    """Refuses a table with rows that were measured with uncommitted changes.
+
+    Args:
+        table: The table of the study.
+        allow_changed: Stages whose rows may be; the README says what had changed. A backbone and its
+            recording belong to no stage and have the name of the recording.
+
+    Raises:
+        InputError: Rows of another stage are.
+    """
+    changed = table[table["saccade"].astype(str).str.endswith(".changed")]
+    stages = set(changed["stage"].fillna(changed["recording"])) - set(allow_changed)
+    if stages:
+        raise InputError(
+            f"measured with uncommitted changes: {', '.join(sorted(map(str, stages)))}; expected at most "
+            f"{', '.join(allow_changed) or 'none'}"
+        )
 
 
 def heading(grid: Grid) -> str:

@@ -225,6 +225,13 @@ def test_report_is_made_from_the_tables_alone_and_always_alike(tmp_path: Path) -
     assert [(tmp_path / name).read_bytes() for name in files] == first
 
 
+@pytest.mark.parametrize("version", ["0.1.0+g0123456789ab", "0.1.0+g0123456789ab.changed"])
+def test_a_table_of_uncommitted_changes_is_marked(tmp_path: Path, version: str) -> None:
+    write_cuts(tmp_path, packages={"saccade": f"0.1.0 and {version}"})
+    marked = "Measured with uncommitted changes" in parse(write_report(tmp_path)[0]).text
+    assert marked == version.endswith(".changed")
+
+
 def test_a_failed_control_is_said(tmp_path: Path) -> None:
     write_patching(tmp_path, control=0.9)
     page, _ = write_report(tmp_path)
