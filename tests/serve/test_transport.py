@@ -6,6 +6,7 @@ import contextlib
 import os
 import socket
 import struct
+import sys
 import threading
 from typing import Any
 
@@ -68,6 +69,19 @@ def test_oversized_requests_cost_their_connection_and_are_logged() -> None:
             wait_for_warning(running, "larger than --max-message-mb")
         assert ask(other, packed({"endpoint": "ping", "pad": "x" * 99_000})) == PONG
         assert len(running.log.warnings()) == 1
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems do not count what a socket received")
+def test_a_message_of_endless_frames_costs_its_connection() -> None:
+    frame = b"\x03" + struct.pack(">Q", 90_000) + bytes(90_000)  # more follow
+    with serving(limits=Limits(message_bytes=100_000)) as running, requester(running.port) as other:
+        with shake_hands(running.port) as made, contextlib.suppress(ConnectionError):
+            for _ in range(10_000):
+                made.sendall(frame)
+        wait_for_warning(running, "in several frames")
+        # The requests of one connection may be more than this together.
+        for _ in range(200):
+            assert ask(other, packed({"endpoint": "ping", "pad": "x" * 99_000})) == PONG
 
 
 def test_clients_that_leave_are_no_problem() -> None:

@@ -24,7 +24,7 @@ from saccade.serve.logs import Log, Statistics
 from saccade.serve.packing import REFUSAL, is_pickle, pack, refusal, unpack
 from saccade.serve.requests import PING, UNAUTHORIZED, Call, check_num_steps, is_allowed, parse
 from saccade.serve.sessions import Sessions
-from saccade.serve.transport import Peer, Transport, address_of
+from saccade.serve.transport import CHECK_SECONDS, Peer, Transport, address_of
 
 if TYPE_CHECKING:
     from saccade.policy.policy import Policy
@@ -161,7 +161,7 @@ class Server:
         self._spoken = self._watched = time.monotonic()
         try:
             while self._stopping is None:
-                self._turn(0.5)
+                self._turn(CHECK_SECONDS)
             self._log.event("stopping", reason=self._stopping, unanswered=len(self._unanswered))
             self._queue.close()
             while self._unanswered:

@@ -2,8 +2,8 @@
 
 libzmq speaks the protocol and bounds what it can: the size of a frame (``MAXMSGSIZE``), the messages of a
 connection that wait (high-water marks), and the time that a silent or unfinished connection lasts
-(heartbeats, ``HANDSHAKE_IVL``). It bounds neither the number of connections, which is done here, nor the
-number of frames in a message that is still arriving.
+(heartbeats, ``HANDSHAKE_IVL``). It bounds neither the number of connections nor the number of frames in a
+message that is still arriving. Both is done here, the latter on Linux only, whose sockets count their bytes.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import contextlib
 import errno
 import socket
 import sys
+import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
@@ -41,6 +42,14 @@ DOMAIN = "saccade"
 #: Files that the server opens besides those of connections.
 SPARE_FILES = 64
 
+#: Bytes that a connection may send after its last request was read, besides those of two requests: what the
+#: system holds, and heartbeats.
+UNREAD_BYTES = 16_000_000
+#: Seconds between two checks of them, about.
+CHECK_SECONDS = 0.1
+#: Where Linux's ``struct tcp_info`` has the number of bytes that were received.
+BYTES_RECEIVED = slice(128, 136)
+
 FAILURES: dict[int, str] = {
     zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL: "closed before the end of the handshake",
     zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL: "expected ZeroMQ's protocol (ZMTP 3) with the server's encryption",
@@ -58,6 +67,15 @@ class Connection:
     name: str
     duplicate: socket.socket | None = None
     is_open: bool = True  # in doubt, too; any thread may read it
+    num_read: int = 0  # bytes that were received when its last request was read
+
+    def num_received(self) -> int:
+        """Bytes that were received; 0 where the system does not say."""
+        if sys.platform == "linux" and self.duplicate is not None:
+            with contextlib.suppress(OSError):  # it is closed
+                info = self.duplicate.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, BYTES_RECEIVED.stop)
+                return int.from_bytes(info[BYTES_RECEIVED], sys.byteorder)
+        return 0
 
     def refuse(self) -> None:
         """Makes libzmq close it."""
@@ -113,7 +131,7 @@ class Transport:
         self._most_clients = min(limits.clients, _most_connections())
         self._by_file: dict[int, Connection] = {}
         self._peers: dict[bytes, Peer] = {}
-        self._failure = ""
+        self._failure, self._checked = "", 0.0
         self._waker, self._woken = socket.socketpair()
         for end in (self._waker, self._woken):
             end.setblocking(False)
@@ -159,13 +177,17 @@ class Transport:
             try:
                 identity, *frames, payload = self._router.recv_multipart(zmq.NOBLOCK, copy=False)
             except zmq.Again:
-                return
+                break
             peer = self._peer(identity.bytes, payload.get(zmq.SRCFD))
+            peer.connection.num_read = peer.connection.num_received()
             longest = max(map(len, frames), default=0)
             if len(frames) > MOST_ENVELOPE_FRAMES or longest > MOST_ENVELOPE_BYTES:
                 self._warn(peer.connection.name, "expected a request in one frame, got several; ignored")
                 continue
             yield peer, [frame.bytes for frame in frames], payload.buffer
+        if time.monotonic() >= self._checked + CHECK_SECONDS:
+            self._checked = time.monotonic()
+            self._refuse_endless()
 
     def send(self, peer: Peer, frames: Sequence[bytes], answer: bytes) -> bool:
         """Whether the answer is on its way; False if the client is gone or does not read its answers."""
@@ -236,6 +258,14 @@ class Transport:
                 if len(self._by_file) > self._most_clients:
                     self._warn(connection.name, f"refused: {self._most_clients} clients are connected")
                     connection.refuse()
+
+    def _refuse_endless(self) -> None:
+        """Closes connections whose message has more bytes than a request may have, in frames without end."""
+        most = 2 * self._limits.message_bytes + UNREAD_BYTES
+        for connection in self._by_file.values():
+            if connection.num_received() - connection.num_read > most:
+                self._warn(connection.name, "its message is larger than --max-message-mb, in several frames")
+                connection.refuse()
 
     def _connection(self, file: int) -> Connection:
         """A connection that was accepted.
