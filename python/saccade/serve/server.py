@@ -76,9 +76,7 @@ class Server:
         >>> def serve(policy: saccade.Policy) -> None:
         ...     log = open_log()
         ...     try:
-        ...         server = Server(policy, bind("127.0.0.1", 5555), log)
-        ...         server.stop_on_signals()
-        ...         server.run()
+        ...         Server(policy, bind("127.0.0.1", 5555), log).run()
         ...     finally:
         ...         log.close()
     """

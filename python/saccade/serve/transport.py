@@ -42,8 +42,7 @@ DOMAIN = "saccade"
 #: Files that the server opens besides those of connections.
 SPARE_FILES = 64
 
-#: Bytes that a connection may send after its last request was read, besides those of two requests: what the
-#: system holds, and heartbeats.
+#: Bytes, besides two of the largest requests, that a connection may send after the last one that was read.
 UNREAD_BYTES = 16_000_000
 #: Seconds between two checks of them, about.
 CHECK_SECONDS = 0.1
