@@ -35,10 +35,9 @@ from matplotlib.figure import Figure as Picture
 from numpy.typing import NDArray
 
 import saccade
-from saccade._internal.environment import cpu_name
-from saccade._internal.files import write_json
 from saccade.errors import InputError
 from saccade_lab.files import writable_directory
+from saccade_lab.machine import cpu_name
 from saccade_lab.sim.environment import TaskEnvironment
 from saccade_lab.sim.policy import Policy
 from saccade_lab.sim.rollout import Episode, environment_for
@@ -356,7 +355,10 @@ def run(args: argparse.Namespace, seeds: range) -> None:
                     more["on_step"] = stack.enter_context(VideoWriter(args.out / "videos" / name)).add
                 one = drive(thinker, environments[task], seed, delay, arm, args.max_steps, **more)
             record["episodes"].append(one.row())
-            write_json(file, record)
+            # A run that is stopped while it writes keeps the last complete file.
+            partial = file.with_suffix(".part")
+            partial.write_text(json.dumps(record, indent=2) + "\n", encoding="utf-8")
+            partial.replace(file)
             print(f"{task} {seed} delay {delay} {arm}: {'done' if one.success else 'failed'} {one.steps}")
 
 

@@ -57,13 +57,13 @@ class Robot:
         self._observations = [policy.example_observation(seed) for seed in range(4)]
         for observation in self._observations:
             observation["language"] = {key: [[instruction]] for key in observation["language"]}
-        self._number_of_looks = 0
+        self._num_observed = 0
         self.sent: Actions = {}
 
-    def look(self) -> dict[str, Any]:
+    def observe(self) -> dict[str, Any]:
         """The newest frames and joint positions."""
-        self._number_of_looks += 1
-        return self._observations[self._number_of_looks % len(self._observations)]
+        self._num_observed += 1
+        return self._observations[self._num_observed % len(self._observations)]
 
     def send(self, action: Actions) -> None:
         """Moves towards an action, `{part: (width,)}`, in the robot's units."""
@@ -92,7 +92,7 @@ class Plan:
 
 
 class Thinker(threading.Thread):
-    """Looks and samples, again and again; `plan` is the newest chunk."""
+    """Observes, encodes and samples, again and again; `plan` is the newest chunk."""
 
     def __init__(self, policy: saccade.Policy, robot: Robot, rate: float) -> None:
         super().__init__(name="policy", daemon=True)
@@ -100,21 +100,22 @@ class Thinker(threading.Thread):
         self._random = np.random.default_rng(0)
         self._stop_asked = threading.Event()
         self._context: saccade.PolicyContext | None = None
-        self._recent: deque[float] = deque(maxlen=4)
+        self.recent: deque[float] = deque(maxlen=4)  # seconds that the last chunks took
         self.tick = -1  # the last one that was sent
-        self.looking: list[float] = []
+        self.encoding: list[float] = []
         self.sampling: list[float] = []
         self._error: BaseException | None = None
         # The first chunk is there before the robot moves. The second tells how long one takes.
-        self.plan = self._think(None)
-        self.plan = self._think(None)
+        self.plan = self.next_plan(None)
+        self.plan = self.next_plan(None)
 
-    def _think(self, last: Plan | None) -> Plan:
+    def next_plan(self, last: Plan | None) -> Plan:
+        """A new chunk from the newest observation, which continues the last one if there is one."""
         tick, seen = self.tick + 1, time.perf_counter()
-        observation = self._robot.look()
-        # Views that have not changed, and the words, are taken from the last context.
+        observation = self._robot.observe()
+        # Views that have not changed, and the instruction, are taken from the last context.
         context = self._policy.encode(observation, previous=self._context)
-        looked = time.perf_counter()
+        encoded = time.perf_counter()
         options: dict[str, Any] = {}
         if last is not None and tick - last.tick < last.horizon:
             # What remains of the last chunk. Its first actions are executed before the new one is here.
@@ -127,23 +128,23 @@ class Thinker(threading.Thread):
         chunk = self._policy.sample(context, observation, seed=self._random, **options)
         done = time.perf_counter()
         self._context = context
-        self._recent.append(done - seen)
-        self.looking.append(looked - seen)
-        self.sampling.append(done - looked)
+        self.recent.append(done - seen)
+        self.encoding.append(encoded - seen)
+        self.sampling.append(done - encoded)
         # Without an overlap the robot has stood still since the frames, so it begins with the first action.
         return Plan(chunk, tick if options or last is None else self.tick + 1, seen)
 
     @property
     def delay(self) -> int:
         """Ticks from frames to actions, of the slowest of the last chunks, rounded up."""
-        return math.ceil(max(self._recent) * self._rate)
+        return math.ceil(max(self.recent) * self._rate)
 
     def run(self) -> None:
         """Runs until `stop`."""
         self.plan = Plan(self.plan.chunk, 0, self.plan.seen)  # the robot has not moved since
         try:
             while not self._stop_asked.is_set():
-                self.plan = self._think(self.plan)  # one reference: no lock is needed
+                self.plan = self.next_plan(self.plan)  # one reference: no lock is needed
         except BaseException as error:
             self._error = error
             self._stop_asked.set()
@@ -236,7 +237,7 @@ def run(policy: saccade.Policy, args: argparse.Namespace, busy: int) -> str:
     robot = Robot(policy, args.instruction)
     with busy_processes(busy):
         thinker = Thinker(policy, robot, args.rate)
-        thinker.looking.clear()
+        thinker.encoding.clear()
         thinker.sampling.clear()
         thinker.start()
         try:
@@ -254,17 +255,17 @@ def run(policy: saccade.Policy, args: argparse.Namespace, busy: int) -> str:
     title = "quiet" if busy == 0 else f"{busy} busy processes"
     print(
         f"\n{title}, {priority}: {len(record.late)} ticks of {1e3 / args.rate:g} ms in {args.seconds:g} s, "
-        f"{record.missed} missed, {record.held} without an action, {len(thinker.looking)} chunks"
+        f"{record.missed} missed, {record.held} without an action, {len(thinker.encoding)} chunks"
     )
     for name, values in (
         ("jitter: start of a tick after its due time", record.late),
         ("age of the frames behind an action", record.age),
-        ("looking: frames and words to a context", thinker.looking),
+        ("encoding: images and instruction to a context", thinker.encoding),
         ("sampling: a chunk", thinker.sampling),
     ):
         print("\n".join(histogram(name, values)))
-    cells = [title, str(len(record.late)), str(record.missed), str(record.held), str(len(thinker.looking))]
-    cells += [quantiles(values) for values in (record.late, record.age, thinker.looking, thinker.sampling)]
+    cells = [title, str(len(record.late)), str(record.missed), str(record.held), str(len(thinker.encoding))]
+    cells += [quantiles(values) for values in (record.late, record.age, thinker.encoding, thinker.sampling)]
     return f"| {' | '.join(cells)} |"
 
 
@@ -321,7 +322,7 @@ def main() -> None:
         print(policy)
         rows = [run(policy, args, busy) for busy in ((0, os.cpu_count() or 1) if args.busy else (0,))]
     print("\nms: median / p99 / max\n")
-    print("| | ticks | missed | without an action | chunks | jitter | age | looking | sampling |")
+    print("| | ticks | missed | without an action | chunks | jitter | age | encoding | sampling |")
     print("|---|---|---|---|---|---|---|---|---|")
     print("\n".join(rows))
 

@@ -113,8 +113,8 @@ def test_the_control_loop_continues_the_last_chunk(monkeypatch: pytest.MonkeyPat
     policy = small_policy(tmp_path)
     thinker = loop.Thinker(policy, loop.Robot(policy, "open the drawer"), rate=10)
     thinker.tick = 4  # the next action is that of tick 5
-    thinker._recent.append(0.25)
-    plan = thinker._think(thinker.plan)
+    thinker.recent.append(0.25)
+    plan = thinker.next_plan(thinker.plan)
     assert (thinker.plan.tick, plan.tick, thinker.delay) == (0, 5, 3)
     for part, values in plan.chunk.items():
         np.testing.assert_allclose(values[0, :3], thinker.plan.chunk[part][0, 5:8], rtol=1e-4, atol=1e-5)
@@ -123,7 +123,7 @@ def test_the_control_loop_continues_the_last_chunk(monkeypatch: pytest.MonkeyPat
     assert plan.action(21) is None
     # After the chunk has ended the robot stands still, so the next one begins with its first action.
     thinker.tick = 30
-    later = thinker._think(plan)
+    later = thinker.next_plan(plan)
     assert later.tick == 31
 
 
@@ -135,7 +135,7 @@ def test_the_control_loop_ends_with_what_ended_the_policy(
     policy = small_policy(tmp_path)
     robot = loop.Robot(policy, "open the drawer")
     thinker = loop.Thinker(policy, robot, rate=10)
-    monkeypatch.setattr(robot, "look", dict)
+    monkeypatch.setattr(robot, "observe", dict)
     thinker.start()
     record = loop.control(thinker, robot, rate=100, seconds=60)
     assert len(record.late) < 1000
@@ -168,7 +168,7 @@ def test_asynchronous_goes_on_where_it_was_and_reports(
     assert len(rows) == len(record["episodes"]) == 8
     assert len(list((tmp_path / "videos").glob("*.mp4"))) == 8
     for (delay, arm, task), row in rows.items():
-        # 20 steps: looks at 8 and 16, whose chunks come `delay` later.
+        # 20 steps: observations at 8 and 16, whose chunks come `delay` later.
         assert row["num_seams"] == {0: 2, 8: 1}[delay], (arm, task)
         assert row["seam"] > 0
         assert row["within"] > 0
