@@ -286,7 +286,7 @@ def take_frames(args: argparse.Namespace, checkpoint: Path) -> tuple[ActionHead,
         title=f'{one.name}: "{one.instruction}", {robot}',
         source={
             "kind": "frames",
-            "moment": one.name,
+            "observation": one.name,
             "instruction": one.instruction,
             "embodiment_id": policy.embodiment_id,
             "precision": args.precision or "float32",

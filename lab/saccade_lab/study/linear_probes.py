@@ -59,12 +59,12 @@ def shuffled_targets(frames: Frames, seed: int) -> dict[str, FloatArray]:
     """
     rng = np.random.default_rng(seed)
     taken = np.empty(len(frames.episodes), np.int64)
-    looks = {episode: np.flatnonzero(frames.episodes == episode) for episode in np.unique(frames.episodes)}
+    rows_of = {episode: np.flatnonzero(frames.episodes == episode) for episode in np.unique(frames.episodes)}
     for task in np.unique(frames.tasks):
         order = rng.permutation(np.unique(frames.episodes[frames.tasks == task]))
         for episode, other in zip(order, np.roll(order, 1), strict=True):
-            numbers = np.minimum(np.arange(len(looks[episode])), len(looks[other]) - 1)
-            taken[looks[episode]] = looks[other][numbers]
+            numbers = np.minimum(np.arange(len(rows_of[episode])), len(rows_of[other]) - 1)
+            taken[rows_of[episode]] = rows_of[other][numbers]
     return {name: values[taken] for name, values in frames.targets.items()}
 
 

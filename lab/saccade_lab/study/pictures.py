@@ -119,8 +119,8 @@ class PictureSource(Recorded):
         return encode(self).other_observation
 
     def labels(self, task: str, seed: int) -> dict[str, Any]:
-        """See ``Source``; with the name of the picture."""
-        return {**super().labels(task, seed), "moment": encode(self).pictures[seed].name}
+        """See ``Source``; with the name of the observation."""
+        return {**super().labels(task, seed), "observation": encode(self).pictures[seed].name}
 
 
 @dataclass(frozen=True, eq=False)

@@ -28,6 +28,7 @@ from saccade_lab.study.table import (
     provenance_path,
     read_provenance,
     read_table,
+    renamed,
     table_path,
     write_provenance,
     write_table,
@@ -248,7 +249,9 @@ def read_record(path: Path) -> dict[str, Any] | None:
     except (ValueError, KeyError, TypeError):
         return None
     fits = isinstance(settings, dict) and isinstance(rows, list) and isinstance(seconds, (int, float))
-    return dict(record) if fits and all(isinstance(row, dict) for row in rows) else None
+    if not fits or not all(isinstance(row, dict) for row in rows):
+        return None
+    return {**record, "rows": [renamed(row) for row in rows]}
 
 
 @dataclass(frozen=True)

@@ -136,7 +136,7 @@ class Simulator(Source):
             "success": episode.success,
             "steps": episode.steps,
             "chunks": episode.chunks,
-            "looks": len(unchanged.observation),
+            "num_observations": len(unchanged.observation),
         }
 
     def labels(self, task: str, seed: int) -> dict[str, Any]:

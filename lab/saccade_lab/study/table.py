@@ -16,6 +16,14 @@ import pandas as pd
 from saccade._internal.files import write_atomically, write_json
 from saccade.errors import InputError
 
+#: Names of columns and settings that tables were written with before, and what they are called now.
+FORMER_NAMES = {"looks": "num_observations", "moment": "observation"}
+
+
+def renamed(values: Mapping[str, Any]) -> dict[str, Any]:
+    """A row or settings with today's names."""
+    return {FORMER_NAMES.get(name, name): value for name, value in values.items()}
+
 
 @dataclass(frozen=True)
 class Provenance:
@@ -84,14 +92,15 @@ def table_content(path: Path) -> bytes:
 
 
 def parse_table(content: bytes, path: Path) -> pd.DataFrame:
-    """The table in the bytes of a CSV file; ``path`` names it in an ``InputError``."""
+    """The table in the bytes of a CSV file, with today's names; ``path`` names it in an ``InputError``."""
     if len(content) <= 1:  # a table without rows has no columns
         return pd.DataFrame()
     try:
         # Words like "none" or "NA" are names here, not missing values.
-        return pd.read_csv(io.BytesIO(content), keep_default_na=False, na_values=[""], low_memory=False)
+        table = pd.read_csv(io.BytesIO(content), keep_default_na=False, na_values=[""], low_memory=False)
     except (pd.errors.ParserError, UnicodeDecodeError) as error:
         raise InputError(f"{path}: not a table: {error}") from None
+    return table.rename(columns=FORMER_NAMES)
 
 
 def write_provenance(provenance: Provenance, path: Path) -> None:
@@ -100,7 +109,7 @@ def write_provenance(provenance: Provenance, path: Path) -> None:
 
 
 def read_provenance(path: Path) -> Provenance:
-    """Reads what ``write_provenance`` wrote.
+    """Reads what ``write_provenance`` wrote; settings have today's names.
 
     Raises:
         FileNotFoundError: The file does not exist.
@@ -109,6 +118,7 @@ def read_provenance(path: Path) -> Provenance:
     try:
         values = json.loads(path.read_text(encoding="utf-8"))
         values.pop("complete")
+        values["settings"] = renamed(values["settings"])
         return Provenance(**values)
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise InputError(f"{path}: not written by a study: {error}") from None

@@ -207,7 +207,7 @@ def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
     assert main(["attention", *words, "--out", str(tmp_path / "out"), "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert found == json.loads((tmp_path / "out" / "attention.json").read_text())
-    assert (found["source"]["moment"], found["source"]["instruction"]) == ("2", "open the drawer")
+    assert (found["source"]["observation"], found["source"]["instruction"]) == ("2", "open the drawer")
     assert [camera["name"] for camera in found["layout"]["cameras"]] == list(CAMERAS)
     assert {token["name"] for token in found["layout"]["tokens"]} >= {"open", "the"}
     assert found["occlusion"]["cell"] == 4

@@ -18,7 +18,7 @@ from saccade.errors import InputError
 from saccade_lab.parallel import Workers
 from saccade_lab.study import table as tables
 from saccade_lab.study.cell import Cell, Rows, digest
-from saccade_lab.study.run import StudyError, run_cells
+from saccade_lab.study.run import StudyError, read_record, run_cells
 from saccade_lab.study.study import STUDIES, load_study
 
 TWO = Workers(jobs=2)
@@ -209,6 +209,17 @@ def test_a_table_comes_back_as_it_was(tmp_path: Path) -> None:
     assert table["count"].tolist() == [3, -4, 5]
     assert table[["note", "later"]].isna().to_numpy().tolist() == [[True, True], [False, True], [True, False]]
     assert math.isnan(table["value"].iloc[2])
+
+
+def test_tables_of_earlier_versions_have_todays_names(tmp_path: Path) -> None:
+    tables.write_table([{"task": "push", "looks": 7, "moment": "pour/1"}], tmp_path / "t.csv")
+    assert list(tables.read_table(tmp_path / "t.csv").columns) == ["task", "num_observations", "observation"]
+    record = {"study": "t", "settings": {"looks": 2}, "done": 1, "total": 1, "complete": True}
+    (tmp_path / "t.json").write_text(json.dumps(record))
+    assert tables.read_provenance(tmp_path / "t.json").settings == {"num_observations": 2}
+    cell = {"key": ["push"], "settings": {}, "seconds": 1.0, "rows": [{"looks": 7}]}
+    (tmp_path / "cell.json").write_text(json.dumps(cell))
+    assert read_record(tmp_path / "cell.json") == {**cell, "rows": [{"num_observations": 7}]}
 
 
 def test_tables_that_are_none(tmp_path: Path) -> None:

@@ -86,7 +86,7 @@ def test_cuts_are_those_of_the_same_features_in_a_file(
     found, expected = table_of(tmp_path / "frames", "cuts"), table_of(tmp_path / "file", "cuts")
     names = ["seed", "arm", "episode", "chunk_change", "chunk_change_max", "noise_change"]
     pd.testing.assert_frame_equal(found[names], expected[names])
-    assert found["moment"].unique().tolist() == ["pour/1", "pour/2", "wipe/1"]
+    assert found["observation"].unique().tolist() == ["pour/1", "pour/2", "wipe/1"]
     settings = read_provenance(tmp_path / "frames" / "cuts.json").settings["frames"]
     assert (settings["name"], settings["episodes"], settings["instruction"]) == ("table", 2, TOLD)
 

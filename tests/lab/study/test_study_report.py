@@ -63,7 +63,7 @@ def cut_row(task: str, seed: int, arm: str, success: bool, change: float) -> dic
         "success": success,
         "steps": 50,
         "chunks": 7,
-        "looks": 7,
+        "num_observations": 7,
         "chunk_change": change,
         "chunk_change_max": 3 * change,
         "note": None,

@@ -254,7 +254,7 @@ class Fast(Study):
                 scales.append(np.abs(known.other - known.chunk).mean())
         return {
             "episode": self.source.labels(task, seed).get("episode", seed),
-            "looks": len(changes),
+            "num_observations": len(changes),
             "chunk_change": float(np.mean(changes)),
             "chunk_change_max": float(np.max(changes)),
             "chunk_error": float(np.mean(errors)),

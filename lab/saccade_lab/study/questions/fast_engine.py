@@ -19,7 +19,7 @@ from saccade_lab.study.wrapped_head import WrappedHead
 
 
 class ModeHead(WrappedHead):
-    """A policy's head in one of the modes, on one thread; a ``saccade.policy.head.Head``.
+    """A policy's head in one of the modes, on one thread; a ``saccade.policy.interfaces.Head``.
 
     Args:
         checkpoint: Directory of the policy.

@@ -24,7 +24,8 @@ from saccade_lab.study.table import clusters_of, truths
 
 BASELINE, ONE_STEP = "float32-euler-4", "float32-euler-1"
 SIZES = {"n1.5": "N1.5's size, random weights", "own": "this checkpoint"}  # the first that was timed counts
-COLUMNS = ("task", "seed", "mode", "index", "value", "success", "looks")  # that are read from any part
+# Those that are read from any part.
+COLUMNS = ("task", "seed", "mode", "index", "value", "success", "num_observations")
 
 
 @dataclass(frozen=True)
@@ -170,11 +171,11 @@ def chunk_estimates(rows: pd.DataFrame) -> tuple[Estimate | None, Estimate | Non
     if rows.empty:
         return None, None, None
     clusters = clusters_of(rows)
-    looks = rows["looks"].to_numpy(dtype=float)
+    counts = rows["num_observations"].to_numpy(dtype=float)
 
     def mean(column: str, over: str | None = None) -> Estimate:
-        whole = looks if over is None else looks * rows[over].to_numpy(dtype=float)
-        return bootstrap_ratio(looks * rows[column].to_numpy(dtype=float), whole, clusters)
+        whole = counts if over is None else counts * rows[over].to_numpy(dtype=float)
+        return bootstrap_ratio(counts * rows[column].to_numpy(dtype=float), whole, clusters)
 
     ratio = None if rows["noise_change"].isna().any() else mean("chunk_change", "noise_change")
     return mean("chunk_change"), ratio, mean("chunk_error")

@@ -52,7 +52,7 @@ def values(table: pd.DataFrame, provenance: Provenance, results: Mapping[str, Mo
         "one_step": ONE_STEP,
         "checkpoint": provenance.settings["checkpoint"],
         "recorded": changes.recorded(of_baseline, of_baseline, provenance) if recorded else None,
-        "looks": 0 if chunks.empty else int(of_baseline["looks"].sum()),
+        "num_observations": 0 if chunks.empty else int(of_baseline["num_observations"].sum()),
         "episodes": not episodes.empty,
         "sizes": [
             {"label": SIZES[size], **one_size(times[times["task"] == size])} for size in timed_sizes(results)

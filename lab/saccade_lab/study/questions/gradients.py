@@ -124,8 +124,7 @@ class Gradients(Study):
 
     def settings(self) -> Mapping[str, Any]:
         """See ``Study``."""
-        # The key that tables have had from the start.
-        observed = {"looks": self.num_observations} if self.source.closed_loop else {}
+        observed = {"num_observations": self.num_observations} if self.source.closed_loop else {}
         return {**self.source.describe(), **observed, "projections": self.projections}
 
     def cells(self) -> Sequence[Cell]:

@@ -25,7 +25,7 @@ def section(table: pd.DataFrame, provenance: Provenance) -> Section:
         recorded=recorded(table, table, provenance) if is_recorded(provenance) else None,
         checkpoint=settings["checkpoint"],
         episodes=episodes.get("actions", 0),
-        looks=settings.get("looks"),
+        num_observations=settings.get("num_observations"),
         projections=settings["projections"],
         demonstrations=episodes.get("loss", 0),
         paths=path_estimates(paths) if len(paths) else None,
