@@ -105,10 +105,28 @@ class Call:
     num_image_tokens: int | None = None
 
     @classmethod
-    def of(cls, config: HeadConfig, num_vl_tokens: int, num_steps: int | None = None, **sizes: int) -> Call:
+    def of(
+        cls,
+        config: HeadConfig,
+        num_vl_tokens: int,
+        num_steps: int | None = None,
+        *,
+        batch: int = 1,
+        num_samples: int = 1,
+        future_refresh: int = 1,
+        num_future_tokens: int | None = None,
+        num_image_tokens: int | None = None,
+    ) -> Call:
         """A call; steps and future tokens default to those of the config."""
-        sizes = {"num_future_tokens": config.num_future_tokens} | sizes
-        return cls(num_vl_tokens, config.num_steps if num_steps is None else num_steps, **sizes)
+        return cls(
+            num_vl_tokens,
+            config.num_steps if num_steps is None else num_steps,
+            batch,
+            num_samples,
+            future_refresh,
+            config.num_future_tokens if num_future_tokens is None else num_future_tokens,
+            num_image_tokens,
+        )
 
     @property
     def image_tokens(self) -> int:

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from os import PathLike
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -22,7 +22,6 @@ from torch import Tensor, nn
 from saccade._internal.arrays import integer
 from saccade._internal.hub import resolve
 from saccade._internal.hub_files import HEAD
-from saccade.errors import InputError
 from saccade.head.chunking import Chunking
 from saccade.head.config import HeadConfig
 from saccade.head.intervention import Intervention, Tokens
@@ -42,11 +41,6 @@ from saccade_lab.reference.layers import (
 )
 from saccade_lab.reference.state_dropout import STATE_DROPOUT, check_probabilities, drops_states, seen_state
 from saccade_lab.reference.training import TimeDistribution, flow_matching_error, hold_unused, is_unused
-
-if TYPE_CHECKING:
-    from typing_extensions import Unpack
-
-    from saccade_lab.reference.options import Conditions, RunOptions, SampleOptions
 
 
 class ActionHead(nn.Module):
@@ -210,7 +204,12 @@ class ActionHead(nn.Module):
         embodiment_id: int | Tensor | np.ndarray,
         actions: Tensor | np.ndarray,
         timestep: int | Tensor | np.ndarray,
-        **conditions: Unpack[Conditions],
+        *,
+        drop_vl: Mask = None,
+        attention_mask: Mask = None,
+        image_mask: Mask = None,
+        intervention: Intervention | Sequence[Intervention] | None = None,
+        stop_gradient: Sequence[tuple[Tokens, Tokens]] = (),
     ) -> Tensor:
         """The velocity of the flow at noisy actions.
 
@@ -220,8 +219,8 @@ class ActionHead(nn.Module):
             embodiment_id: An int, or ``(B,)``.
             actions: ``(B, T, encoder_action_dim)``.
             timestep: Time bucket, an int or ``(B,)``.
-            **conditions: ``drop_vl``, ``attention_mask``, ``image_mask``, ``intervention`` and
-                ``stop_gradient`` as in ``trace``. This evaluation is step 0 of 1.
+            drop_vl, attention_mask, image_mask, intervention, stop_gradient: As in ``trace``. This
+                evaluation is step 0 of 1.
 
         Returns:
             ``(B, T, action_dim)``.
@@ -231,8 +230,16 @@ class ActionHead(nn.Module):
             InputError: The head does not have the embodiment, or a place of an intervention.
         """
         vl_embs = self.as_input(vl_embs)
-        check_shape("vl_embs", vl_embs, (None, None, self.config.context_dim))
-        run = Run(self.config, vl_embs, num_steps=1, **conditions)
+        run = Run(
+            self.config,
+            vl_embs,
+            num_steps=1,
+            drop_vl=drop_vl,
+            attention_mask=attention_mask,
+            image_mask=image_mask,
+            intervention=intervention,
+            stop_gradient=stop_gradient,
+        )
         return self.velocity_in(run, 0, vl_embs, state, embodiment_id, actions, timestep)
 
     def velocity_in(
@@ -285,7 +292,11 @@ class ActionHead(nn.Module):
         future_refresh: int | None = None,
         previous_chunk: Tensor | np.ndarray | None = None,
         chunking: Chunking | None = None,
-        **conditions: Unpack[Conditions],
+        drop_vl: Mask = None,
+        attention_mask: Mask = None,
+        image_mask: Mask = None,
+        intervention: Intervention | Sequence[Intervention] | None = None,
+        stop_gradient: Sequence[tuple[Tokens, Tokens]] = (),
     ) -> Tensor:
         """Follows the flow from noise (time 0) to actions (time 1) in equal steps.
 
@@ -297,14 +308,14 @@ class ActionHead(nn.Module):
             future_refresh: The state rows and the future rows are recomputed every ``future_refresh``
                 velocity evaluations, starting with the first. At the others, self-attention reads them as
                 they were. Default: at every evaluation.
-            previous_chunk: The chunk that the robot is executing, ``(B, rows, action_dim)`` or `(B, rows,
-                encoder_action_dim)``, normalised, with at least ``chunking.horizon` rows. Required with
-                ``chunking``.
+            previous_chunk: The chunk that the robot is executing, ``(B, rows, action_dim)`` or
+                ``(B, rows, encoder_action_dim)``, normalised, with at least ``chunking.horizon`` rows.
+                Required with ``chunking``.
             chunking: How this chunk continues the previous one. ``velocity_strength`` is the factor of the
                 velocity, in both evaluations of a midpoint step.
-            **conditions: ``drop_vl``, ``attention_mask``, ``image_mask``, ``intervention`` and
-                ``stop_gradient`` as in ``trace``. All evaluations of a step belong to that step. A patch of
-                rows at a step where they are not always computed is an error.
+            drop_vl, attention_mask, image_mask, intervention, stop_gradient: As in ``trace``. All evaluations
+                of a step belong to that step. A patch of rows at a step where they are not always computed is
+                an error.
 
         Returns:
             Actions ``(B, T, action_dim)``, normalised.
@@ -314,12 +325,17 @@ class ActionHead(nn.Module):
             InputError: A value is out of range, or an intervention does not fit the head.
         """
         vl_embs = self.as_input(vl_embs)
-        run = self.run_of(
+        run = Run(
+            self.config,
             vl_embs,
-            num_steps,
+            num_steps=num_steps,
             in_step=INTEGRATORS[check_integrator(integrator)],
             future_refresh=1 if future_refresh is None else integer("future_refresh", future_refresh),
-            **conditions,
+            drop_vl=drop_vl,
+            attention_mask=attention_mask,
+            image_mask=image_mask,
+            intervention=intervention,
+            stop_gradient=stop_gradient,
         )
         previous = None if previous_chunk is None else self.as_input(previous_chunk)
         start, strength = start_of(self.as_input(noise), previous, chunking, self.config)
@@ -371,9 +387,10 @@ class ActionHead(nn.Module):
             InputError: A value is out of range, or an intervention does not fit the head.
         """
         vl_embs = self.as_input(vl_embs)
-        run = self.run_of(
+        run = Run(
+            self.config,
             vl_embs,
-            num_steps,
+            num_steps=num_steps,
             intervention=intervention,
             drop_vl=drop_vl,
             attention_mask=attention_mask,
@@ -385,19 +402,6 @@ class ActionHead(nn.Module):
         )
         actions = self.follow(run, vl_embs, state, embodiment_id, self.as_input(noise))
         return Trace(attention=run.attention, hidden=run.hidden, rows=run.rows, actions=actions)
-
-    def run_of(self, vl_embs: Tensor, num_steps: int | None, **options: Unpack[RunOptions]) -> Run:
-        """A run with this number of steps, or that of the config.
-
-        Raises:
-            InputError: The number of steps is out of range, or an option does not fit the head.
-        """
-        config = self.config
-        num_steps = config.num_steps if num_steps is None else integer("num_steps", num_steps)
-        if not 1 <= num_steps <= config.num_timestep_buckets:
-            raise InputError(f"num_steps: {num_steps}, expected 1 to {config.num_timestep_buckets}")
-        check_shape("vl_embs", vl_embs, (None, None, config.context_dim))
-        return Run(config, vl_embs, num_steps=num_steps, **options)
 
     def follow(
         self,
@@ -436,11 +440,36 @@ class ActionHead(nn.Module):
         backbone_features: Tensor | np.ndarray,
         state: Tensor | np.ndarray,
         embodiment_id: int | Tensor | np.ndarray,
-        **options: Unpack[SampleOptions],
+        *,
+        noise: Tensor | np.ndarray,
+        num_steps: int | None = None,
+        integrator: str | None = None,
+        future_refresh: int | None = None,
+        previous_chunk: Tensor | np.ndarray | None = None,
+        chunking: Chunking | None = None,
+        drop_vl: Mask = None,
+        attention_mask: Mask = None,
+        image_mask: Mask = None,
+        intervention: Intervention | Sequence[Intervention] | None = None,
+        stop_gradient: Sequence[tuple[Tokens, Tokens]] = (),
     ) -> Tensor:
-        """``encode`` followed by ``sample``, whose keyword arguments it accepts; ``noise`` is required."""
-        vl_embs = self.encode(backbone_features, drop_vl=options.get("drop_vl"))
-        return self.sample(vl_embs, state, embodiment_id, **options)
+        """``encode`` followed by ``sample``, which documents the other arguments."""
+        return self.sample(
+            self.encode(backbone_features, drop_vl=drop_vl),
+            state,
+            embodiment_id,
+            noise=noise,
+            num_steps=num_steps,
+            integrator=integrator,
+            future_refresh=future_refresh,
+            previous_chunk=previous_chunk,
+            chunking=chunking,
+            drop_vl=drop_vl,
+            attention_mask=attention_mask,
+            image_mask=image_mask,
+            intervention=intervention,
+            stop_gradient=stop_gradient,
+        )
 
     def sample_time(self, batch: int, generator: torch.Generator | None = None) -> Tensor:
         """Draws flow times for training.

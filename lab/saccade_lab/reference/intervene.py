@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from saccade._internal.arrays import boolean, indices
+from saccade._internal.arrays import boolean, indices, integer
 from saccade.errors import InputError
 from saccade.head.config import HeadConfig
 from saccade.head.intervention import ROW_GROUPS, Chosen, Intervention, Tokens, as_interventions
@@ -105,7 +105,7 @@ class Run:
     Args:
         config: Config of the head.
         vl_embs: ``(B, S, context_dim)``. The run has its dtype and device.
-        num_steps: Number of steps.
+        num_steps: Number of steps. Default: that of the config.
         in_step: Velocity evaluations in each step.
         future_refresh: The state rows and the future rows are recomputed every ``future_refresh``
             evaluations, starting with the first.
@@ -130,7 +130,7 @@ class Run:
         config: HeadConfig,
         vl_embs: Tensor,
         *,
-        num_steps: int,
+        num_steps: int | None = None,
         in_step: int = 1,
         future_refresh: int = 1,
         intervention: Intervention | Sequence[Intervention] | None = None,
@@ -142,6 +142,10 @@ class Run:
         blocks: Sequence[int] | int | None = None,
         steps: Sequence[int] | int | None = None,
     ) -> None:
+        num_steps = config.num_steps if num_steps is None else integer("num_steps", num_steps)
+        if not 1 <= num_steps <= config.num_timestep_buckets:
+            raise InputError(f"num_steps: {num_steps}, expected 1 to {config.num_timestep_buckets}")
+        check_shape("vl_embs", vl_embs, (None, None, config.context_dim))
         self.config = config
         self.num_steps = num_steps
         self.in_step = in_step

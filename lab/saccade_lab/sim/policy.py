@@ -17,7 +17,7 @@ from saccade.errors import CheckpointError, InputError, ShapeError
 from saccade.head.intervention import Intervention
 from saccade.policy.interfaces import Head
 from saccade.processor import Processor
-from saccade.robots import LANGUAGE_KEY
+from saccade.robots import LANGUAGE_KEY, DataConfigLike
 from saccade_lab.files import checkpoint_identity
 from saccade_lab.inside import context_of, features_of, inputs_of
 from saccade_lab.sim.settings import CONFIG_FILE, FILES, GROUPS, SimulationConfig
@@ -31,7 +31,13 @@ ENGINES = ("rust", "torch")
 
 
 def load_whole(
-    checkpoint: Path, engine: str = "rust", num_threads: int | None = None, **overrides: Any
+    checkpoint: Path,
+    engine: str = "rust",
+    num_threads: int | None = None,
+    *,
+    data_config: DataConfigLike | None = None,
+    action_horizon: int | None = None,
+    processor_options: Mapping[str, Any] | None = None,
 ) -> saccade.Policy:
     """The policy of a checkpoint, computed by one of ``ENGINES``.
 
@@ -39,20 +45,32 @@ def load_whole(
         checkpoint: A directory.
         engine: ``"rust"``, or ``"torch"`` for ``saccade_lab.reference``, which needs torch.
         num_threads: Number of threads; for torch, of the whole process.
-        **overrides: ``data_config``, ``action_horizon`` and ``processor_options`` of
-            ``saccade.Policy.from_pretrained``; only with ``"rust"``.
+        data_config, action_horizon, processor_options: As for ``saccade.Policy.from_pretrained``; only with
+            ``"rust"``.
 
     Raises:
         FileNotFoundError, CheckpointError: As ``saccade.Policy.from_pretrained``.
-        InputError: Unknown engine, ``num_threads`` below 1, or ``overrides`` with ``"torch"``.
+        InputError: Unknown engine, ``num_threads`` below 1, or one of the last three with ``"torch"``.
     """
     if num_threads is not None and num_threads < 1:
         raise InputError(f"num_threads: given {num_threads}, expected at least 1")
     if engine == "rust":
-        return saccade.Policy.from_pretrained(checkpoint, num_threads=num_threads, **overrides)
+        return saccade.Policy.from_pretrained(
+            checkpoint,
+            num_threads=num_threads,
+            data_config=data_config,
+            action_horizon=action_horizon,
+            processor_options=processor_options,
+        )
     if engine == "torch":
-        if overrides:
-            raise InputError(f"{', '.join(overrides)}: expected engine 'rust', got 'torch'")
+        overrides = {
+            "data_config": data_config,
+            "action_horizon": action_horizon,
+            "processor_options": processor_options,
+        }
+        given = [name for name, value in overrides.items() if value is not None]
+        if given:
+            raise InputError(f"{', '.join(given)}: expected engine 'rust', got 'torch'")
         from saccade_lab.sim.torch_engine import load_policy
 
         return load_policy(checkpoint, num_threads)
@@ -106,7 +124,9 @@ class Policy:
         *,
         engine: str = "rust",
         num_threads: int | None = None,
-        **overrides: Any,
+        data_config: DataConfigLike | None = None,
+        action_horizon: int | None = None,
+        processor_options: Mapping[str, Any] | None = None,
     ) -> Policy:
         """Loads a policy.
 
@@ -114,7 +134,8 @@ class Policy:
             checkpoint: A directory that ``saccade train`` wrote. Default: the bundled policy.
             engine: ``"rust"`` or ``"torch"``.
             num_threads: Number of threads.
-            **overrides: As in ``load_whole``.
+            data_config, action_horizon, processor_options: As for ``saccade.Policy.from_pretrained``; only
+                with ``"rust"``.
 
         Raises:
             FileNotFoundError: A file is not there.
@@ -128,7 +149,14 @@ class Policy:
         for name in FILES:
             if not (directory / name).is_file():
                 raise FileNotFoundError(f"{directory / name}: no such file")
-        whole = load_whole(directory, engine, num_threads, **overrides)
+        whole = load_whole(
+            directory,
+            engine,
+            num_threads,
+            data_config=data_config,
+            action_horizon=action_horizon,
+            processor_options=processor_options,
+        )
         normalizer = whole.normalizer
         for kind, groups in (("state", normalizer.state_groups), ("action", normalizer.action_groups)):
             found = {group.key: group.size for group in groups}
