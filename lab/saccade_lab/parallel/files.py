@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import fcntl
 import hashlib
 import os
 import shutil
@@ -101,6 +100,8 @@ def place(shipment: Shipment, get: Callable[[Any], UInt8Array]) -> Path:
 
     if is_complete():
         return found
+    import fcntl  # not at the top: Windows has none, and imports this module
+
     with (cache / f"{shipment.sha256}.lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)  # released when the file is closed, by a killed process too
         if not is_complete():
@@ -152,7 +153,7 @@ def located(work: Any, files: Iterable[str | Path]) -> tuple[dict[str, Path], An
 
     Args:
         work: As ``relocated`` takes values. A string is a path if it contains a separator (see
-            ``saccade._internal.files.path_text``); a word may be equal to the name of a file.
+            ``saccade_lab.files.path_text``); a word may be equal to the name of a file.
         files: Files and directories, each named in any way.
     """
     sources = {str(path): path for path in (_absolute(file) for file in files if Path(file).exists())}
