@@ -1,4 +1,4 @@
-"""The report: docs/results/backbone.md, written from the JSON of the measurements."""
+"""The report docs/results/backbone.md, from the JSON of the measurements; neither is committed yet."""
 
 from __future__ import annotations
 

@@ -1,6 +1,7 @@
 """Writes tests/data/backbone_layers.safetensors: layers of Qwen3 and SigLIP, by transformers in float64.
 
-The Rust tests of saccade's layers compare with it. To write it again: ``python tests/backbone_layers.py``.
+The Rust tests of saccade's layers compare with it. To write it again:
+``python tests/helpers/backbone_layers.py``.
 """
 
 from pathlib import Path

@@ -4,7 +4,7 @@ PEFT is not needed by the tests. Install it to write the files again, then run t
 
     pip install --no-deps peft==0.17.1 accelerate==1.10.1
     pip install psutil
-    HF_HUB_OFFLINE=1 PYTHONPATH=tests python tests/make_adapter_fixtures.py
+    HF_HUB_OFFLINE=1 PYTHONPATH=. python tests/helpers/make_adapter_fixtures.py
 """
 
 from __future__ import annotations

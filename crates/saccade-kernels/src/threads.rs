@@ -4,7 +4,7 @@
 //! are bound by memory: siblings share one core's requests to it. On hybrid CPUs an efficiency core does about a third of the multiply-adds
 //! of a performance core (half the vector width at three quarters of the clock): threads there would add little to the first limit and
 //! nothing to the second, and a robot has other work for them. How many of these threads a product gets depends on its size (`linear`).
-//! `benches/throughput.py` measures from which number of threads on memory is the limit of a machine.
+//! `benches/peers/throughput.py` measures from which number of threads on memory is the limit of a machine.
 
 use std::num::NonZeroUsize;
 
