@@ -9,7 +9,7 @@ from lerobot.configs.types import FeatureType, PolicyFeature
 from lerobot.envs.configs import EnvConfig
 from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_STATE
 
-from saccade._internal.extras import SACCADE
+from saccade._internal.extras import install_lab
 from saccade.errors import MissingExtraError
 
 
@@ -37,7 +37,7 @@ class SaccadeEnv(EnvConfig):
     def __post_init__(self) -> None:
         if importlib.util.find_spec("saccade_lab") is None:
             raise MissingExtraError(
-                f"saccade_lab is not installed. Install with: {SACCADE.install_lab()}", name="saccade_lab"
+                f"saccade_lab is not installed. Install with: {install_lab('sim')}", name="saccade_lab"
             )
         # Not at the top: it chooses how MuJoCo draws, which concerns only those who use these tasks.
         from saccade_lab.extras import LAB
