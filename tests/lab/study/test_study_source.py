@@ -132,7 +132,7 @@ def test_every_study_of_the_table_is_one() -> None:
 
 def test_what_is_no_study_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(STUDIES, "cell", ("saccade_lab.study.cell:Cell", "no study"))
-    with pytest.raises(TypeError, match=r"saccade\.study\.cell\.Cell: expected a subclass of Study"):
+    with pytest.raises(TypeError, match=r"saccade_lab\.study\.cell\.Cell: expected a subclass of Study"):
         load_study("cell")
     assert Cell(("a",)).name == "a"
 
