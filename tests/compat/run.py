@@ -149,12 +149,17 @@ def main() -> None:
     )
     parser.add_argument("--page", type=Path, default=ROOT / "docs" / "results" / "compatibility.md")
     options = parser.parse_args()
+    describe = ["git", "describe", "--always", "--dirty", "--exclude", "*"]
+    commit = subprocess.run(describe, cwd=ROOT, capture_output=True, text=True, check=True).stdout.strip()
     chosen = [release for release in RELEASES if release.lerobot in (options.releases or [release.lerobot])]
     for release in chosen:
         set_up(release, options.python312)
         run_tests(release)
     if chosen == list(RELEASES):
-        write(options.page, page([json.loads(release.result.read_text()) for release in RELEASES]))
+        reports = [json.loads(release.result.read_text()) for release in RELEASES]
+        if commit.endswith("-dirty"):
+            sys.exit(f"compat: passed at {commit}, with uncommitted changes; no page is written of these")
+        write(options.page, page(reports, commit))
 
 
 def set_up(release: Release, python312: str | None) -> None:
@@ -200,8 +205,8 @@ def run_tests(release: Release) -> None:
         sys.exit(done.returncode)
 
 
-def page(reports: list[dict[str, Any]]) -> str:
-    """The page for the given results."""
+def page(reports: list[dict[str, Any]], commit: str) -> str:
+    """The page for the given results of a commit."""
     reports = sorted(reports, key=lambda report: report["versions"]["lerobot"])
     rows = [["", *(f"lerobot {report['versions']['lerobot']}" for report in reports)]]
     rows.append(["head", *(f"GR00T {report['kind'].upper()}" for report in reports)])
@@ -213,7 +218,7 @@ def page(reports: list[dict[str, Any]]) -> str:
         rows.append([text, *("" if cell is None else f"{cell:.0e}" for cell in cells)])
     lines = [f"| {' | '.join(row)} |" for row in rows]
     lines.insert(1, f"| {' | '.join(['---'] * len(rows[0]))} |")
-    return "\n".join([INTRODUCTION, *lines, "", CHECKED])
+    return "\n".join([INTRODUCTION, f"It is of commit {commit}.", "", *lines, "", CHECKED])
 
 
 def write(path: Path, text: str) -> None:
