@@ -11,6 +11,7 @@ import pytest
 from benches.pages.report import UncommittedError, report, require_commit
 from benches.peers import __main__ as peers
 from benches.peers.results import RECORDS, Results
+from benches.records import COMMANDS, RESULTS
 
 ROOT = Path(__file__).resolve().parents[2]
 DIRTY = {"demo": {"machine": {"commit": "0123abc"}}, "full": [{"machine": {"commit": "4567def-dirty"}}]}
@@ -53,3 +54,21 @@ def test_peers_write_no_page_of_such_a_record(tmp_path: Path) -> None:
 @pytest.mark.parametrize("path", sorted((ROOT / "benches").rglob("*.json")), ids=lambda path: path.name)
 def test_committed_records_are_of_committed_trees(path: Path) -> None:
     require_commit(json.loads(path.read_text()), path)
+
+
+def test_the_records_of_guides_are_those_that_their_commands_write() -> None:
+    assert {path.stem for path in RESULTS.iterdir()} == set(COMMANDS)
+    for name, command in COMMANDS.items():
+        assert json.loads((RESULTS / f"{name}.json").read_text())["command"] == f"saccade {command} --json"
+
+
+def test_the_table_of_simulated_episodes_has_the_numbers_of_its_records() -> None:
+    page = (ROOT / "docs" / "simulation.md").read_text()
+    engines = [
+        json.loads((RESULTS / f"simulation-{engine}.json").read_text())["printed"]["summary"]
+        for engine in ("rust", "torch")
+    ]
+    for rust, torch in zip(*engines, strict=True):
+        counts = [f"{each['successes']}/{each['episodes']}" for each in (rust, torch)]
+        (row,) = (line for line in page.splitlines() if line.startswith(f"| {rust['task']} | {counts[0]}"))
+        assert row.endswith(f" | {counts[1]} | {rust['median_steps']:.0f} |")
