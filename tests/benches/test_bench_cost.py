@@ -213,6 +213,8 @@ def test_the_model_expects_less_of_tiles() -> None:
     assert measured_like(replace(MACHINE, isa="amx", family="Granite Rapids")).cpu == "a Xeon with AMX"
     others = [replace(MACHINE, isa=isa) for isa in ("avx512", "avx2", "bf16")]
     assert {measured_like(each).cpu for each in others} == {"a Zen 5 with AVX-512"}
+    hidden = replace(MACHINE, isa="avx512", family="Sapphire Rapids")
+    assert measured_like(hidden).cpu == "a Xeon without AMX"
 
 
 # The roofline
