@@ -92,6 +92,7 @@ def test_an_answer_that_nobody_takes_is_counted() -> None:
     policy.gate.clear()
     with serving(policy) as running:
         ask_and_leave(running.port)
+        assert ping(running.port) == PONG
         # It may have been taken before its client left, or not.
         policy.gate.set()
         wait_until(lambda: any(line["endpoint"] == "get_action" for line in running.log.requests()))
