@@ -63,7 +63,6 @@ class Policy:
         The head of the bundled demo policy, on the features of one observation. The state is the position of
         the hand (x, y, z) and the opening of the gripper:
 
-        >>> import importlib.resources
         >>> import numpy as np, saccade
         >>> head = saccade.ActionHead.from_pretrained(saccade.demo_checkpoint())
         >>> policy = saccade.Policy(head)
