@@ -186,7 +186,7 @@ def run_rust_tests(session: nox.Session) -> None:
     """
     cargo(session, "test", "--locked", "--quiet")
     for example in ("sample", "look_inside"):
-        command = ("run", "--locked", "--quiet", "--package", "saccade-groot", "--example", example)
+        command = ("run", "--locked", "--quiet", "--package", "saccade-vla", "--example", example)
         session.run("cargo", *command, silent=True, external=True)
 
 
@@ -342,7 +342,7 @@ def sanitize(session: nox.Session) -> None:
         session.error("needs a nightly Rust: rustup toolchain install nightly")
     if shutil.which("valgrind") is None:
         session.error("valgrind is not installed; install the package valgrind")
-    kernels = ("test", "--locked", "--quiet", "--package", "saccade-kernels")
+    kernels = ("test", "--locked", "--quiet", "--package", "saccade-vla-kernels")
     skipped = [word for name in ASAN_SKIPPED.split() for word in ("--skip", name)]
     target = ("--target", "x86_64-unknown-linux-gnu", "--target-dir", "target/sanitize")
     cargo(

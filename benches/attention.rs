@@ -6,7 +6,9 @@ use saccade_benches::measure::{Contender, measure};
 use saccade_benches::options::Options;
 use saccade_benches::random::Random;
 use saccade_benches::report::Report;
-use saccade_kernels::{Arithmetic, Element, Isa, LogitBias, Mask, PackedKeyValues, Rows, RowsMut, attention};
+use saccade_vla_kernels::{
+    Arithmetic, Element, Isa, LogitBias, Mask, PackedKeyValues, Rows, RowsMut, attention,
+};
 
 /// `(queries, keys, num_heads, head_dim)`: cross- and self-attention of a DiT block, with one camera and with three, the same of the action
 /// rows alone; self-attention of a VL block; a head of width 128.

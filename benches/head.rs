@@ -9,8 +9,8 @@ use std::path::{Path, PathBuf};
 
 use criterion::{Criterion, criterion_group, criterion_main};
 use half::bf16;
-use saccade::{ActionHead, Array, ArrayMut, Features, LoadOptions, Sampling};
 use saccade_benches::random::Random;
+use saccade_vla::{ActionHead, Array, ArrayMut, Features, LoadOptions, Sampling};
 use serde_json::{Map, Value, json};
 
 const NUM_VL_TOKENS: usize = 296;

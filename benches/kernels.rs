@@ -4,7 +4,7 @@ use std::hint::black_box;
 
 use criterion::{Criterion, Throughput, criterion_group, criterion_main};
 use saccade_benches::random::Random;
-use saccade_kernels::{
+use saccade_vla_kernels::{
     Arithmetic, Element, Isa, Matrix, PackedKeyValues, PackedLinear, Rows, RowsMut, WeightRef, gelu_erf,
     gelu_tanh, layer_norm, relu, silu,
 };

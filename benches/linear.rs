@@ -13,8 +13,8 @@ use saccade_benches::measure::{Contender, arithmetic_name, measure};
 use saccade_benches::options::Options;
 use saccade_benches::random::Random;
 use saccade_benches::report::Report;
-use saccade_kernels::peak::{READ_STREAMS, read_bytes_per_second};
-use saccade_kernels::{
+use saccade_vla_kernels::peak::{READ_STREAMS, read_bytes_per_second};
+use saccade_vla_kernels::{
     Arithmetic, Epilogue, Isa, LinearScratch, Matrix, PackedLinear, Rows, RowsMut, WeightRef, quantize_rows,
 };
 

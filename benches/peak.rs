@@ -3,8 +3,8 @@
 use saccade_benches::measure::{Contender, measure, quantile};
 use saccade_benches::options::Options;
 use saccade_benches::report::Report;
-use saccade_kernels::peak::{READ_STREAMS, clock_hz, read_bytes_per_second};
-use saccade_kernels::{Arithmetic, Isa};
+use saccade_vla_kernels::peak::{READ_STREAMS, clock_hz, read_bytes_per_second};
+use saccade_vla_kernels::{Arithmetic, Isa};
 
 fn main() {
     let options = Options::from_args();

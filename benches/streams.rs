@@ -1,5 +1,5 @@
 //! Asking memory for weights as many streams, beside asking for them in their order: what the column `streams` of the table in
-//! `saccade-kernels/src/cpu/family.rs` is filled by. Weights come from memory; both are measured by turns.
+//! `saccade-vla-kernels/src/cpu/family.rs` is filled by. Weights come from memory; both are measured by turns.
 //!
 //! `cargo bench -p saccade-benches --bench streams -- --threads 1,2 --rounds 60`
 
@@ -7,7 +7,7 @@ use saccade_benches::measure::{Contender, arithmetic_name, measure};
 use saccade_benches::options::Options;
 use saccade_benches::random::Random;
 use saccade_benches::report::Report;
-use saccade_kernels::{
+use saccade_vla_kernels::{
     Arithmetic, Element, Epilogue, Isa, LinearScratch, Matrix, PackedLinear, Rows, RowsMut, WeightRef,
 };
 
@@ -38,7 +38,7 @@ fn has_streams(isa: Isa) -> bool {
 fn main() {
     let options = Options::from_args();
     let mut report = Report::begin("streams", &options);
-    println!("{}", saccade_kernels::CpuReport::current().family);
+    println!("{}", saccade_vla_kernels::CpuReport::current().family);
     let (measured, left_out): (Vec<_>, Vec<_>) =
         Isa::available().into_iter().partition(|&isa| has_streams(isa));
     let left_out: Vec<_> = left_out.iter().map(Isa::to_string).collect();

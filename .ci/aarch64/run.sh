@@ -147,7 +147,7 @@ rust() (
         echo "aarch64: Rust tests on $cpu"
         cross "$cpu"
         cargo test --locked --quiet "${LEAST[@]}" --target $TARGET --no-fail-fast \
-            -p saccade-kernels -p saccade-checkpoint -p saccade-groot --lib --tests -- "${SKIPPED[@]}"
+            -p saccade-vla-kernels -p saccade-vla-checkpoint -p saccade-vla --lib --tests -- "${SKIPPED[@]}"
     done
 )
 
@@ -182,15 +182,15 @@ run_python() {
 loops() (
     cross
     packages llvm-19
-    CARGO_PROFILE_RELEASE_LTO=false cargo rustc --locked --quiet --release --target $TARGET -p saccade-kernels --lib -- \
+    CARGO_PROFILE_RELEASE_LTO=false cargo rustc --locked --quiet --release --target $TARGET -p saccade-vla-kernels --lib -- \
         --emit asm -C codegen-units=1
-    python3 .ci/aarch64/loops.py "$(ls -t "$WORK/target/$TARGET"/release/deps/saccade_kernels-*.s | head -1)"
+    python3 .ci/aarch64/loops.py "$(ls -t "$WORK/target/$TARGET"/release/deps/saccade_vla_kernels-*.s | head -1)"
 )
 
 # The emulator writes a line for every instruction. Two numbers of calls: packing and starting count in neither.
 instructions() (
     cross
-    CARGO_PROFILE_RELEASE_LTO=false cargo build --locked --quiet --release --target $TARGET -p saccade-kernels --example linear_calls
+    CARGO_PROFILE_RELEASE_LTO=false cargo build --locked --quiet --release --target $TARGET -p saccade-vla-kernels --example linear_calls
     local program=$WORK/target/$TARGET/release/examples/linear_calls rows=49 inputs=512 outputs=96
     count() {
         SACCADE_ISA=$1 qemu-aarch64-static -cpu max -L /usr/aarch64-linux-gnu -singlestep -d nochain,exec -D /dev/stdout \
@@ -223,7 +223,7 @@ lint() (
     cross
     unpack rust-web-clippy bin/cargo-clippy
     SYSROOT=$RUST LD_LIBRARY_PATH=$RUST/lib/x86_64-linux-gnu "$RUST/bin/cargo-clippy" clippy --locked --quiet "${LEAST[@]}" \
-        --target $TARGET -p saccade-kernels -p saccade-checkpoint -p saccade-groot --all-targets -- --deny warnings
+        --target $TARGET -p saccade-vla-kernels -p saccade-vla-checkpoint -p saccade-vla --all-targets -- --deny warnings
 )
 
 check() (
@@ -234,7 +234,7 @@ check() (
     for target in aarch64-apple-darwin x86_64-pc-windows-msvc; do
         echo "aarch64: checking for $target"
         RUSTFLAGS="--deny warnings" cargo check --locked --quiet -Zbuild-std=std,panic_abort --target $target \
-            -p saccade-kernels -p saccade-checkpoint -p saccade-groot --lib
+            -p saccade-vla-kernels -p saccade-vla-checkpoint -p saccade-vla --lib
     done
 )
 

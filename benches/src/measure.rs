@@ -4,8 +4,8 @@ use std::time::{Duration, Instant};
 
 use rustix::time::{ClockId, clock_gettime};
 
-use saccade_kernels::peak::multiply_accumulate;
-use saccade_kernels::{Arithmetic, Isa};
+use saccade_vla_kernels::peak::multiply_accumulate;
+use saccade_vla_kernels::{Arithmetic, Isa};
 
 use crate::options::{Clock, Options};
 

@@ -5,13 +5,13 @@ use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::sync::LazyLock;
 
-use saccade::{
+use saccade_vla::{
     Array, Frame, HeadConfig, Observation, Preprocessing, Processor, ProcessorOptions, ProcessorSource,
     Published, ResizeOptions, RewriteOptions, Tokenizer, TokenizerFiles, resize, resized_config,
     tensor_shapes,
 };
-use saccade_checkpoint::spec::TensorSpec;
-use saccade_checkpoint::{Checkpoint, Companions};
+use saccade_vla_checkpoint::spec::TensorSpec;
+use saccade_vla_checkpoint::{Checkpoint, Companions};
 
 /// More than any tensor of an input: reading may not take more memory than the file has bytes, twice for widened halves.
 const MAX_BYTES_READ: usize = 1 << 26;
@@ -56,7 +56,7 @@ pub fn use_checkpoint(path: &Path) {
         let mut nbytes = 0;
         let read = checkpoint.read_bytes(name, |bytes| {
             nbytes += bytes.len() as u64;
-            Ok::<(), saccade_checkpoint::Error>(())
+            Ok::<(), saccade_vla_checkpoint::Error>(())
         });
         match read {
             Ok(()) => assert_eq!(nbytes, checkpoint.nbytes(name).expect("it was read")),

@@ -6,7 +6,7 @@ use numpy::{
 };
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
-use saccade::{Array, ArrayMut, ElementsRef, Error, OwnedArray, TensorView, TensorViews};
+use saccade_vla::{Array, ArrayMut, ElementsRef, Error, OwnedArray, TensorView, TensorViews};
 
 use crate::error::raise;
 

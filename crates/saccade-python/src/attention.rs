@@ -3,14 +3,14 @@
 use numpy::{PyReadonlyArrayDyn, PyReadwriteArrayDyn, PyUntypedArrayMethods};
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
-use saccade::KeyOptions;
+use saccade_vla::KeyOptions;
 
 use crate::arrays::{Mask, held_tensors, optional_view, tensor_views, view, view_mut};
 use crate::detached::call;
 use crate::error::raise;
 
 #[pyclass(frozen, module = "saccade._saccade")]
-pub(crate) struct KeyValues(saccade::KeyValues);
+pub(crate) struct KeyValues(saccade_vla::KeyValues);
 
 #[pymethods]
 impl KeyValues {
@@ -31,7 +31,7 @@ impl KeyValues {
 }
 
 #[pyclass(frozen, module = "saccade._saccade")]
-pub(crate) struct CrossAttention(saccade::CrossAttention);
+pub(crate) struct CrossAttention(saccade_vla::CrossAttention);
 
 #[pymethods]
 impl CrossAttention {
@@ -41,7 +41,7 @@ impl CrossAttention {
         let held = held_tensors(tensors)?;
         let views = tensor_views(&held)?;
         call(py, || {
-            saccade::CrossAttention::new(&views, num_heads, precision, None)
+            saccade_vla::CrossAttention::new(&views, num_heads, precision, None)
         })
         .map(Self)
     }

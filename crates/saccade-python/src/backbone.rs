@@ -6,7 +6,7 @@ use std::sync::Arc;
 use numpy::{PyArrayDyn, PyReadonlyArrayDyn};
 use pyo3::prelude::*;
 use pyo3::types::{PyDict, PyTuple};
-use saccade::{BackboneConfig, BackboneInputs, BackboneKeep, BackboneLoadOptions, OwnedArray};
+use saccade_vla::{BackboneConfig, BackboneInputs, BackboneKeep, BackboneLoadOptions, OwnedArray};
 
 use crate::arrays::{Mask, held_tensors, optional_view, tensor_views, to_numpy, view};
 use crate::detached::call;
@@ -32,7 +32,7 @@ impl PyInputs<'_> {
 }
 
 #[pyclass(frozen, module = "saccade._saccade")]
-pub(crate) struct BackboneFeatures(Arc<saccade::BackboneFeatures>);
+pub(crate) struct BackboneFeatures(Arc<saccade_vla::BackboneFeatures>);
 
 #[pymethods]
 impl BackboneFeatures {
@@ -68,7 +68,7 @@ type PyBackboneRecord<'py> = (
 );
 
 #[pyclass(frozen, module = "saccade._saccade")]
-pub(crate) struct Backbone(saccade::Backbone);
+pub(crate) struct Backbone(saccade_vla::Backbone);
 
 #[pymethods]
 impl Backbone {
@@ -81,7 +81,7 @@ impl Backbone {
         num_threads: Option<usize>,
     ) -> PyResult<Self> {
         let options = options(config, precision, num_threads)?;
-        call(py, || saccade::Backbone::load(&source, &options)).map(Self)
+        call(py, || saccade_vla::Backbone::load(&source, &options)).map(Self)
     }
 
     #[staticmethod]
@@ -95,7 +95,7 @@ impl Backbone {
         let options = options(config, precision, num_threads)?;
         let held = held_tensors(tensors)?;
         let views = tensor_views(&held)?;
-        call(py, || saccade::Backbone::from_tensors(&views, &options)).map(Self)
+        call(py, || saccade_vla::Backbone::from_tensors(&views, &options)).map(Self)
     }
 
     fn config<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
@@ -134,7 +134,8 @@ impl Backbone {
     ) -> PyResult<Vec<(BackboneFeatures, PyBackboneRecord<'py>)>> {
         let views = inputs.iter().map(PyInputs::view).collect::<PyResult<Vec<_>>>()?;
         let previous: Vec<_> = previous.iter().map(|features| Arc::clone(&features.0)).collect();
-        let previous: Vec<&saccade::BackboneFeatures> = previous.iter().map(|features| &**features).collect();
+        let previous: Vec<&saccade_vla::BackboneFeatures> =
+            previous.iter().map(|features| &**features).collect();
         let keep = BackboneKeep::default()
             .with_hidden(hidden)
             .with_vision(vision)
@@ -162,14 +163,14 @@ impl Backbone {
 
 /// A backbone in a checkpoint, before it is loaded.
 #[pyclass(frozen, module = "saccade._saccade")]
-pub(crate) struct PublishedBackbone(saccade::PublishedBackbone);
+pub(crate) struct PublishedBackbone(saccade_vla::PublishedBackbone);
 
 #[pymethods]
 impl PublishedBackbone {
     #[staticmethod]
     fn open(py: Python<'_>, source: PathBuf, config: Option<String>) -> PyResult<Self> {
         call(py, || {
-            saccade::PublishedBackbone::open(&source, config.as_deref())
+            saccade_vla::PublishedBackbone::open(&source, config.as_deref())
         })
         .map(Self)
     }

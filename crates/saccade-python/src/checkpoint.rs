@@ -6,7 +6,7 @@ use std::path::PathBuf;
 use numpy::PyArrayDyn;
 use pyo3::prelude::*;
 use pyo3::types::{PyBytes, PyDict};
-use saccade::{Checkpoint, TensorFacts};
+use saccade_vla::{Checkpoint, TensorFacts};
 
 use crate::arrays::to_numpy;
 use crate::config::config_dict;
@@ -57,7 +57,7 @@ pub(crate) fn read_stored<'py>(
         let dtype = call(py, || {
             checkpoint.read_bytes(name, |piece| {
                 bytes.extend_from_slice(piece);
-                Ok::<_, saccade::Error>(())
+                Ok::<_, saccade_vla::Error>(())
             })?;
             Ok(format!("{:?}", checkpoint.dtype(name)?))
         })?;
@@ -72,13 +72,13 @@ type PyTensorFacts = (String, String, Vec<usize>, u64);
 
 /// An open checkpoint and what it is.
 #[pyclass(frozen, module = "saccade._saccade")]
-pub(crate) struct Published(saccade::Published);
+pub(crate) struct Published(saccade_vla::Published);
 
 #[pymethods]
 impl Published {
     #[staticmethod]
     fn open(py: Python<'_>, source: PathBuf, config: Option<String>) -> PyResult<Self> {
-        call(py, || saccade::Published::open(&source, config.as_deref())).map(Self)
+        call(py, || saccade_vla::Published::open(&source, config.as_deref())).map(Self)
     }
 
     /// The base of the adapter in a directory.
@@ -90,7 +90,7 @@ impl Published {
         adapter: Option<PathBuf>,
     ) -> PyResult<Self> {
         call(py, || {
-            saccade::open_base(&source, config.as_deref(), adapter.as_deref())
+            saccade_vla::open_base(&source, config.as_deref(), adapter.as_deref())
         })
         .map(Self)
     }

@@ -2,7 +2,7 @@
 
 use pyo3::prelude::*;
 use pyo3::types::{PyDict, PyTuple};
-use saccade::HeadConfig;
+use saccade_vla::HeadConfig;
 
 use crate::detached::call;
 
@@ -71,5 +71,5 @@ pub(crate) fn parse_config<'py>(
 /// Name, without a prefix, and shape of every tensor of a head with this config.
 #[pyfunction]
 pub(crate) fn tensor_shapes(py: Python<'_>, text: &str) -> PyResult<Vec<(String, Vec<usize>)>> {
-    call(py, || saccade::tensor_shapes(&HeadConfig::from_json(text)?))
+    call(py, || saccade_vla::tensor_shapes(&HeadConfig::from_json(text)?))
 }

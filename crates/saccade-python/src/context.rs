@@ -8,7 +8,7 @@ use pyo3::prelude::*;
 use crate::arrays::{copied, to_numpy};
 
 #[pyclass(frozen, module = "saccade._saccade")]
-pub(crate) struct Context(pub(crate) Arc<saccade::Context>);
+pub(crate) struct Context(pub(crate) Arc<saccade_vla::Context>);
 
 #[pymethods]
 impl Context {

@@ -4,7 +4,7 @@ use std::cell::{Cell, RefCell};
 use std::panic::{AssertUnwindSafe, catch_unwind};
 
 use pyo3::prelude::*;
-use saccade::interruptible;
+use saccade_vla::interruptible;
 
 use crate::error::{bug, raise};
 
@@ -13,7 +13,10 @@ use crate::error::{bug, raise};
 ///
 /// On the main thread, the only one on which Python handles signals, the core asks every 20 ms or so whether to go on, and Python's signal
 /// handlers run then. What one raises, such as `KeyboardInterrupt`, ends the work and is raised.
-pub(crate) fn call<T: Send>(py: Python<'_>, work: impl FnOnce() -> saccade::Result<T> + Send) -> PyResult<T> {
+pub(crate) fn call<T: Send>(
+    py: Python<'_>,
+    work: impl FnOnce() -> saccade_vla::Result<T> + Send,
+) -> PyResult<T> {
     let handles_signals = is_main_thread(py);
     // A panic leaves nothing half-changed behind that a later call sees: heads are immutable, and a workspace that was in use is dropped.
     let outcome = py.detach(|| {

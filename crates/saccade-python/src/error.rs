@@ -6,7 +6,7 @@ use pyo3::exceptions::{PyFileNotFoundError, PyMemoryError};
 use pyo3::prelude::*;
 use pyo3::sync::PyOnceLock;
 use pyo3::types::PyType;
-use saccade::{Error, ErrorKind};
+use saccade_vla::{Error, ErrorKind};
 
 /// What Python users can do about an error of the core, by how its message begins. The core's own words are for every language.
 const HINTS: [(&str, &str); 2] = [

@@ -6,7 +6,7 @@ use std::sync::Arc;
 use numpy::{PyArrayDyn, PyReadonlyArrayDyn, PyReadwriteArrayDyn, PyUntypedArrayMethods};
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
-use saccade::{
+use saccade_vla::{
     Chunking, Features, Group, Integrator, Keep, LoadOptions, NoisyActions, Sampling, TraceOptions,
 };
 
@@ -18,7 +18,7 @@ use crate::error::raise;
 use crate::intervention::{PyIntervention, PyRecorded, interventions, recorded};
 
 #[pyclass(frozen, module = "saccade._saccade")]
-pub(crate) struct ActionHead(saccade::ActionHead);
+pub(crate) struct ActionHead(saccade_vla::ActionHead);
 
 #[pymethods]
 impl ActionHead {
@@ -41,7 +41,7 @@ impl ActionHead {
             .with_num_states(num_states)
             .with_precision(precision.parse().map_err(raise)?)
             .with_num_threads(num_threads);
-        call(py, || saccade::ActionHead::load(&source, &options)).map(Self)
+        call(py, || saccade_vla::ActionHead::load(&source, &options)).map(Self)
     }
 
     #[staticmethod]
@@ -62,7 +62,7 @@ impl ActionHead {
             .with_num_threads(num_threads);
         let held = held_tensors(tensors)?;
         let views = tensor_views(&held)?;
-        call(py, || saccade::ActionHead::from_tensors(&views, &options)).map(Self)
+        call(py, || saccade_vla::ActionHead::from_tensors(&views, &options)).map(Self)
     }
 
     fn config<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {

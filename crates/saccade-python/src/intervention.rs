@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use numpy::PyReadonlyArrayDyn;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
-use saccade::{Group, OwnedArray, Patch, Recorded, Tokens};
+use saccade_vla::{Group, OwnedArray, Patch, Recorded, Tokens};
 
 use crate::arrays::{owned, to_numpy};
 use crate::error::raise;
@@ -31,7 +31,7 @@ pub(crate) fn tokens((name, indices): PyTokens) -> PyResult<Tokens> {
     Ok(Tokens { group, indices })
 }
 
-pub(crate) fn intervention(given: PyIntervention<'_>) -> PyResult<saccade::Intervention> {
+pub(crate) fn intervention(given: PyIntervention<'_>) -> PyResult<saccade_vla::Intervention> {
     let cut = |(reader, source)| Ok((tokens(reader)?, tokens(source)?));
     let key_bias = |(keys, bias)| Ok((tokens(keys)?, owned(&bias)?));
     let patch = |((step, block), patched, rows)| {
@@ -42,7 +42,7 @@ pub(crate) fn intervention(given: PyIntervention<'_>) -> PyResult<saccade::Inter
             rows: owned(&rows)?,
         })
     };
-    Ok(saccade::Intervention {
+    Ok(saccade_vla::Intervention {
         cut: given.cut.into_iter().map(cut).collect::<PyResult<_>>()?,
         key_bias: given
             .key_bias
@@ -57,7 +57,7 @@ pub(crate) fn intervention(given: PyIntervention<'_>) -> PyResult<saccade::Inter
     })
 }
 
-pub(crate) fn interventions(given: Vec<PyIntervention<'_>>) -> PyResult<Vec<saccade::Intervention>> {
+pub(crate) fn interventions(given: Vec<PyIntervention<'_>>) -> PyResult<Vec<saccade_vla::Intervention>> {
     given.into_iter().map(intervention).collect()
 }
 

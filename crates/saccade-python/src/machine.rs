@@ -3,8 +3,8 @@
 use pyo3::exceptions::PyMemoryError;
 use pyo3::prelude::*;
 use pyo3::types::{PyDict, PyTuple};
-use saccade::peak::{self, PeakError};
-use saccade::{Arithmetic, CpuReport, Error, Isa, Part, Profile, Profiling};
+use saccade_vla::peak::{self, PeakError};
+use saccade_vla::{Arithmetic, CpuReport, Error, Isa, Part, Profile, Profiling};
 
 use crate::detached::call;
 use crate::error::raise;
@@ -57,7 +57,7 @@ pub(crate) fn measure_peaks(py: Python<'_>, num_threads: usize) -> PyResult<Boun
 /// A context in which calls of this thread compute on it alone, whatever number of threads a head or backbone has.
 #[pyclass(unsendable, name = "stay_on_this_thread", module = "saccade._saccade")]
 #[derive(Default)]
-pub(crate) struct StayOnThisThread(Option<saccade::StayOnThisThread>);
+pub(crate) struct StayOnThisThread(Option<saccade_vla::StayOnThisThread>);
 
 #[pymethods]
 impl StayOnThisThread {
@@ -67,7 +67,7 @@ impl StayOnThisThread {
     }
 
     fn __enter__(&mut self) {
-        self.0 = Some(saccade::stay_on_this_thread());
+        self.0 = Some(saccade_vla::stay_on_this_thread());
     }
 
     #[pyo3(signature = (*_error))]
@@ -164,6 +164,6 @@ pub(crate) fn cpu_report() -> (String, String, String) {
 
 #[pyfunction]
 pub(crate) fn default_num_threads() -> PyResult<usize> {
-    let threads = saccade::default_num_threads();
+    let threads = saccade_vla::default_num_threads();
     threads.map(usize::from).map_err(|error| raise(error.into()))
 }

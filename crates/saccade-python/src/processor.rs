@@ -4,7 +4,9 @@ use std::path::PathBuf;
 
 use numpy::{PyArrayDyn, PyReadonlyArrayDyn};
 use pyo3::prelude::*;
-use saccade::{Frame, Observation, OwnedArray, Preprocessing, ProcessorOptions, Tokenizer, TokenizerFiles};
+use saccade_vla::{
+    Frame, Observation, OwnedArray, Preprocessing, ProcessorOptions, Tokenizer, TokenizerFiles,
+};
 
 use crate::arrays::{to_numpy, view};
 use crate::detached::call;
@@ -42,13 +44,13 @@ type PyPrepared<'py> = (
 
 /// What a checkpoint says about its processor.
 #[pyclass(frozen, module = "saccade._saccade")]
-pub(crate) struct ProcessorSource(saccade::ProcessorSource);
+pub(crate) struct ProcessorSource(saccade_vla::ProcessorSource);
 
 #[pymethods]
 impl ProcessorSource {
     #[new]
     fn new(py: Python<'_>, source: PathBuf) -> PyResult<Self> {
-        call(py, || saccade::ProcessorSource::open(&source)).map(Self)
+        call(py, || saccade_vla::ProcessorSource::open(&source)).map(Self)
     }
 
     #[getter]
@@ -73,7 +75,7 @@ impl ProcessorSource {
 }
 
 #[pyclass(frozen, module = "saccade._saccade")]
-pub(crate) struct Processor(saccade::Processor);
+pub(crate) struct Processor(saccade_vla::Processor);
 
 #[pymethods]
 impl Processor {
@@ -102,7 +104,7 @@ impl Processor {
         };
         call(py, || {
             let tokenizer = Tokenizer::read(&TokenizerFiles::at(&tokenizer)?)?;
-            saccade::Processor::new(version, tokenizer, &options)
+            saccade_vla::Processor::new(version, tokenizer, &options)
         })
         .map(Self)
     }

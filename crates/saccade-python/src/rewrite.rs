@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use numpy::{PyArrayDyn, PyReadonlyArrayDyn, PyUntypedArrayMethods};
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
-use saccade::{ConvertOptions, Error, ResizeOptions, RewriteOptions, Written};
+use saccade_vla::{ConvertOptions, Error, ResizeOptions, RewriteOptions, Written};
 
 use crate::arrays::to_numpy;
 use crate::detached::call;
@@ -33,7 +33,12 @@ impl PyRewrite {
     fn run<R: Send>(
         self,
         py: Python<'_>,
-        work: impl FnOnce(&Path, &Path, RewriteOptions, &mut dyn FnMut(u64, u64) -> bool) -> saccade::Result<R>
+        work: impl FnOnce(
+            &Path,
+            &Path,
+            RewriteOptions,
+            &mut dyn FnMut(u64, u64) -> bool,
+        ) -> saccade_vla::Result<R>
         + Send,
     ) -> PyResult<R> {
         let mut options = RewriteOptions::new();
@@ -71,7 +76,7 @@ fn written_dict(py: Python<'_>, written: Written) -> PyResult<Bound<'_, PyDict>>
 #[pyfunction]
 pub(crate) fn quantize<'py>(py: Python<'py>, rewrite: PyRewrite) -> PyResult<Bound<'py, PyDict>> {
     let report = rewrite.run(py, |source, out, options, progress| {
-        saccade::quantize(source, out, &options, progress)
+        saccade_vla::quantize(source, out, &options, progress)
     })?;
     let dict = written_dict(py, report.written)?;
     dict.set_item("num_quantized", report.num_quantized)?;
@@ -97,7 +102,7 @@ pub(crate) fn convert<'py>(
     let report = rewrite.run(py, |source, out, rewrite, progress| {
         let mut options = ConvertOptions::new(rewrite);
         (options.embodiment_ids, options.dtype, options.adapter) = (embodiment_ids, dtype, adapter);
-        saccade::convert(source, out, &options, progress)
+        saccade_vla::convert(source, out, &options, progress)
     })?;
     let dict = written_dict(py, report.written)?;
     dict.set_item("num_merged", report.num_merged)?;
@@ -125,7 +130,7 @@ pub(crate) fn resize<'py>(
     let report = rewrite.run(py, |source, out, rewrite, progress| {
         let mut options = ResizeOptions::new(rewrite, num_future_tokens);
         (options.perturbation, options.seed) = (perturbation, seed);
-        saccade::resize(source, out, &options, progress)
+        saccade_vla::resize(source, out, &options, progress)
     })?;
     let dict = written_dict(py, report.written)?;
     dict.set_item("num_before", report.num_before)?;
@@ -157,7 +162,7 @@ pub(crate) fn merge_future_tokens<'py>(
         ))));
     };
     let merged = call(py, || {
-        saccade::merge_future_tokens(rows, width, num_future_tokens, key_bias.as_deref())
+        saccade_vla::merge_future_tokens(rows, width, num_future_tokens, key_bias.as_deref())
     })?;
     let tokens = to_numpy(py, merged.tokens, &[merged.sources.len(), width])?;
     Ok((tokens, merged.sources, merged.key_bias))

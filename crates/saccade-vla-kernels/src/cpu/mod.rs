@@ -1,0 +1,170 @@
+//! Which CPU this is, what was measured on its family, and whether the system lets this process use tiles.
+
+pub(crate) mod family;
+mod once;
+mod signature;
+pub(crate) mod tiles;
+
+use std::fmt;
+
+use family::{Family, Rates};
+use once::Once;
+use signature::Signature;
+
+/// What is known of a CPU.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Cpu {
+    signature: Option<Signature>,
+    /// Its own family.
+    family: Option<&'static Family>,
+    /// The family whose rates decide: its own where that was measured, else the newest of its vendor that was.
+    measured: Option<&'static Family>,
+}
+
+impl Cpu {
+    fn new(signature: Option<Signature>) -> Self {
+        let family = signature.and_then(family::of);
+        let own = family.filter(|family| family.rates.is_some());
+        Self {
+            signature,
+            family,
+            measured: own.or_else(|| family::newest_measured(signature?.vendor)),
+        }
+    }
+
+    /// That of this process, looked at once.
+    pub(crate) fn current() -> &'static Self {
+        static CURRENT: Once<Cpu> = Once::new();
+        CURRENT.get_or_make(|| Self::new(Signature::current()))
+    }
+
+    fn rates(&self) -> Option<&Rates> {
+        self.measured?.rates.as_ref()
+    }
+
+    /// Whether AVX512-BF16 multiplies faster than float32 does: what is widened instead has the rate of float32.
+    pub(crate) fn has_fast_bf16_dot(&self) -> bool {
+        self.rates().is_none_or(|rates| rates.bf16_dot > rates.float32)
+    }
+
+    /// Whether weights are asked for as many streams of memory.
+    pub(crate) fn wants_streams(&self) -> bool {
+        self.rates().is_some_and(|rates| rates.streams)
+    }
+}
+
+/// The name of its family and its numbers, where CPUID has them.
+impl fmt::Display for Cpu {
+    fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let name = self.family.map_or("unknown family", |family| family.name);
+        match self.signature {
+            Some(signature) => write!(formatter, "{name} ({signature})"),
+            None => formatter.write_str(std::env::consts::ARCH),
+        }
+    }
+}
+
+/// What decides which kernels this process uses, in words.
+///
+/// ```
+/// let cpu = saccade_vla_kernels::CpuReport::current();
+/// assert!(!cpu.family.is_empty() && !cpu.rates.is_empty() && !cpu.tiles.is_empty());
+/// ```
+#[derive(Clone, Debug)]
+#[non_exhaustive]
+pub struct CpuReport {
+    /// The family, with its vendor and numbers: `Zen 4 (AuthenticAMD, family 25, model 17)`.
+    pub family: String,
+    /// The family whose measured rates choose between kernels, and whether it is this one.
+    pub rates: String,
+    /// Whether AMX can be used, and if not, why.
+    pub tiles: String,
+}
+
+impl CpuReport {
+    /// That of this process. The first call asks the system for AMX.
+    #[must_use]
+    pub fn current() -> Self {
+        Self::of(Cpu::current(), tiles::permission())
+    }
+
+    fn of(cpu: &Cpu, tiles: Result<(), tiles::Refusal>) -> Self {
+        let rates = match (cpu.measured, cpu.family) {
+            (None, _) => "none measured for this vendor".to_owned(),
+            (Some(measured), Some(own)) if measured.name == own.name => format!("{}, measured", own.name),
+            (Some(measured), _) => {
+                format!(
+                    "{}, the newest family of this vendor that was measured",
+                    measured.name
+                )
+            }
+        };
+        Self {
+            family: cpu.to_string(),
+            rates,
+            tiles: tiles.map_or_else(|refusal| format!("no: {refusal}"), |()| "yes".to_owned()),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::signature::{Vendor, signature};
+    use super::tiles::Refusal;
+    use super::*;
+
+    fn cpu(vendor: Vendor, family: u32, model: u32) -> Cpu {
+        Cpu::new(Some(signature(vendor, family, model, 0)))
+    }
+
+    #[test]
+    fn a_measured_family_gets_what_was_measured() {
+        let genoa = cpu(Vendor::Amd, 25, 17);
+        assert!(genoa.has_fast_bf16_dot() && !genoa.wants_streams());
+        let turin = cpu(Vendor::Amd, 26, 2);
+        assert!(turin.has_fast_bf16_dot());
+        for model in [0x8f, 0xcf] {
+            let rapids = cpu(Vendor::Intel, 6, model);
+            assert!(!rapids.has_fast_bf16_dot() && rapids.wants_streams());
+        }
+        let report = CpuReport::of(&genoa, Err(Refusal::NotThere));
+        assert_eq!(report.family, "Zen 4 (AuthenticAMD, family 25, model 17)");
+        assert_eq!(report.rates, "Zen 4, measured");
+        assert_eq!(report.tiles, "no: this CPU lacks AMX");
+    }
+
+    /// Known by name and not measured, or not known at all.
+    #[test]
+    fn another_family_gets_what_its_vendors_newest_gets() {
+        let newest = "the newest family of this vendor that was measured";
+        for (model, name) in [
+            (0xad, "Granite Rapids"),
+            (0x6a, "Ice Lake"),
+            (0xfe, "unknown family"),
+        ] {
+            let cpu = cpu(Vendor::Intel, 6, model);
+            assert!(!cpu.has_fast_bf16_dot() && cpu.wants_streams(), "{name}");
+            let report = CpuReport::of(&cpu, Ok(()));
+            assert_eq!(
+                report.family,
+                format!("{name} (GenuineIntel, family 6, model {model})")
+            );
+            assert_eq!(report.rates, format!("Emerald Rapids, {newest}"));
+            assert_eq!(report.tiles, "yes");
+        }
+        let zen6 = cpu(Vendor::Amd, 26, 0x50);
+        assert!(zen6.has_fast_bf16_dot());
+        let report = CpuReport::of(&zen6, Err(Refusal::NotThere));
+        assert_eq!(report.rates, format!("Zen 5, {newest}"));
+    }
+
+    /// Then what the CPU has is used, as before there was a table.
+    #[test]
+    fn a_vendor_that_nobody_measured_gets_what_its_cpu_has() {
+        for cpu in [Cpu::new(None), cpu(Vendor::Other, 6, 0x8f)] {
+            assert!(cpu.has_fast_bf16_dot() && !cpu.wants_streams());
+            let report = CpuReport::of(&cpu, Err(Refusal::NotThere));
+            assert_eq!(report.rates, "none measured for this vendor");
+        }
+    }
+}

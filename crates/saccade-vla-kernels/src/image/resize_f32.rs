@@ -1,0 +1,142 @@
+//! Linear, antialiased resizing in float32, as torch 2.9 for x86-64 does it.
+
+use super::taps::Taps;
+use super::{Image, Sums, TOGETHER, along_height, along_width, blank, padded, reserved};
+use crate::aligned::AllocError;
+use crate::isa::Isa;
+
+/// An image in float32: 0 is black and 1 is full.
+#[derive(Clone, Debug, PartialEq)]
+pub struct FloatImage {
+    /// `(height, width, 3)`.
+    pub pixels: Vec<f32>,
+    /// Number of rows.
+    pub height: usize,
+    /// Number of columns.
+    pub width: usize,
+}
+
+impl FloatImage {
+    /// Times 255 in float32, truncated to bytes: `(height, width, 3)`.
+    ///
+    /// # Errors
+    /// If the system refuses the memory.
+    pub fn truncated(&self) -> Result<Vec<u8>, AllocError> {
+        let mut bytes = blank(self.pixels.len())?;
+        for index in 0..bytes.len() {
+            bytes[index] = (self.pixels[index] * 255.0) as u8;
+        }
+        Ok(bytes)
+    }
+}
+
+/// `image / 255` resized to `(height, width, 3)`: linear, antialiased, along the width and then along the height, as torch's
+/// `interpolate(..., mode="bilinear", antialias=True)` of float32.
+///
+/// The taps of an output are summed as torch's compiled loop does: of those after the first, four at a time with a rounded product, the last
+/// ones fused.
+///
+/// ```
+/// use saccade_vla_kernels::{Image, Isa, resize_linear_f32};
+/// let white = vec![255; 40 * 30 * 3];
+/// let small = resize_linear_f32(Isa::best(), Image::new(&white, 40, 30), 20, 20)?;
+/// assert!(small.pixels.iter().all(|value| (value - 1.0).abs() < 1e-6));
+/// # Ok::<(), saccade_vla_kernels::AllocError>(())
+/// ```
+///
+/// # Errors
+/// If the system refuses the memory.
+///
+/// # Panics
+/// If `height` or `width` is 0, or if this CPU lacks `isa`.
+pub fn resize_linear_f32(
+    isa: Isa,
+    image: Image<'_>,
+    height: usize,
+    width: usize,
+) -> Result<FloatImage, AllocError> {
+    assert!(height > 0 && width > 0);
+    let narrow = along_width(isa, &Linear::new(image.width, width)?, image)?;
+    let pixels = along_height(isa, &Linear::new(image.height, height)?, &narrow, width)?;
+    Ok(FloatImage {
+        pixels,
+        height,
+        width,
+    })
+}
+
+/// The sums of one axis.
+struct Linear(Taps<f32>);
+
+impl Linear {
+    /// Every `as f32` is where torch rounds to float32; between them it computes in double.
+    fn new(from: usize, to: usize) -> Result<Self, AllocError> {
+        let scale = (from as f64 / to as f64) as f32;
+        let support = scale.max(1.0);
+        let shrink = match scale >= 1.0 {
+            true => 1.0 / scale,
+            false => 1.0,
+        };
+        let mut taps = Taps::with_room(to)?;
+        let mut weights: Vec<f32> = reserved((2.0 * support) as usize + 3)?;
+        for output in 0..to {
+            let centre = (f64::from(scale) * (output as f64 + 0.5)) as f32;
+            // A negative number becomes 0.
+            let first = (f64::from(centre - support) + 0.5) as usize;
+            let end = ((f64::from(centre + support) + 0.5) as usize).min(from);
+            weights.clear();
+            weights.extend((first..end).map(|input| {
+                let distance = (input as f64 - f64::from(centre)) as f32;
+                let x = ((f64::from(distance) + 0.5) * f64::from(shrink)) as f32;
+                match x.abs() < 1.0 {
+                    true => 1.0 - x.abs(),
+                    false => 0.0,
+                }
+            }));
+            let sum = weights.iter().fold(0.0, |sum, weight| sum + weight);
+            weights.iter_mut().for_each(|weight| *weight /= sum);
+            taps.push(first, &weights)?;
+        }
+        Ok(Self(taps))
+    }
+}
+
+impl Sums for Linear {
+    type Value = f32;
+
+    fn num_outputs(&self) -> usize {
+        self.0.len()
+    }
+
+    #[inline(always)]
+    fn value(byte: u8) -> f32 {
+        f32::from(byte) / 255.0
+    }
+
+    #[inline(always)]
+    fn sum(&self, index: usize, inputs: &[f32], inner: usize, out: &mut [f32]) {
+        let (first, weights) = self.0.of(index);
+        let inputs = &inputs[first * inner..(first + weights.len()) * inner];
+        // The first tap, and as many fours of the others as there are.
+        let rounded = 1 + (weights.len() - 1) / 4 * 4;
+        for start in (0..inner).step_by(TOGETHER) {
+            let len = TOGETHER.min(inner - start);
+            let mut sums = [0.0; TOGETHER];
+            for tap in 0..weights.len() {
+                let weight = weights[tap];
+                let row = padded(&inputs[tap * inner + start..][..len]);
+                if tap < rounded {
+                    // Zero plus the first product is that product.
+                    for index in 0..TOGETHER {
+                        sums[index] += row[index] * weight;
+                    }
+                } else {
+                    for index in 0..TOGETHER {
+                        sums[index] = f32::mul_add(row[index], weight, sums[index]);
+                    }
+                }
+            }
+            out[start..start + len].copy_from_slice(&sums[..len]);
+        }
+    }
+}

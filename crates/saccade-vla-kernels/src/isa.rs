@@ -1,0 +1,446 @@
+//! Instruction sets: the table of what each one uses, which ones this CPU has, and which one is chosen.
+
+use std::fmt;
+use std::str::FromStr;
+
+use crate::cpu::tiles::{Refusal, permission};
+use crate::gemm::amx::{InTiles, Pairs, Quads};
+use crate::gemm::broadcast::{Plain, RoundedRows, Widened};
+#[allow(
+    unused_imports,
+    reason = "not every architecture has an instruction set with such products"
+)]
+use crate::gemm::dot_bf16::DotBf16;
+use crate::gemm::dot_int8::DotInt8;
+#[cfg(target_arch = "aarch64")]
+use crate::gemm::neon::{
+    bf16::Bfmmla,
+    float32::{Float32, RoundedBf16, WidenedBf16},
+    int8::{Sdot, Usmmla, Widening},
+};
+use crate::gemm::{Gemm, Product, available};
+#[cfg(target_arch = "aarch64")]
+use crate::simd::aarch64::neon::{Neon, NeonBf16, NeonDotprod, NeonI8mm};
+use crate::simd::portable::{Loops, Portable};
+#[cfg(target_arch = "x86_64")]
+use crate::simd::x86_64::{
+    avx2::{Avx2, Avx2EvexVnni, Avx2VexVnni},
+    avx512::{Avx512, Avx512Amx, Avx512Bf16, Avx512Vnni},
+};
+use crate::simd::{Dot, Dots, Kernel, MAX_LANES, MAX_TILE_ROWS, Simd, Vector};
+#[cfg(target_arch = "x86_64")]
+use crate::tiles::amx::Amx;
+use crate::tiles::{Software, TILE, TileKernel, TileUnit};
+
+/// Environment variable that forces an instruction set, so that every path can be tested on one machine.
+pub const ISA_VARIABLE: &str = "SACCADE_ISA";
+
+/// A product that is made of vectors, unless the instruction set has its own ones.
+macro_rules! of_vectors_unless {
+    ([] $product:ty) => {
+        available::<$product>()
+    };
+    ([$own:ty] $product:ty) => {
+        None
+    };
+}
+
+/// A line is an instruction set by the name that users give it, slowest first: `Name = "name" if CONDITION { ... }`, and in the braces
+/// - `vectors`: what every kernel runs on;
+/// - `bf16`, `int8`: instruction sets with the same vectors and an instruction for dot products of these elements, of which a kernel for
+///   such products uses the first that the CPU has, and else `vectors`;
+/// - `gemm_bf16`, `gemm_int8`: products with packed weights of these elements, likewise; those after the last one listed are made of
+///   `vectors` alone;
+/// - `needs`: of these types, the CPU must have at least one;
+/// - `gemm_f32`, `gemm_widened`: float32 rows with float32 weights, and with bfloat16 ones, where these products are not made of `vectors`
+///   either; then no product is.
+/// - `tiles`: the unit that multiplies tiles, where there is one, and which must be there: attention over bfloat16 uses it.
+macro_rules! instruction_sets {
+    ($(
+        $(#[$doc:meta])*
+        $isa:ident = $name:literal if $condition:meta {
+            vectors: $vectors:ty,
+            bf16: [$($bf16:ty),*],
+            int8: [$($int8:ty),*],
+            gemm_bf16: [$($gemm_bf16:ty),*],
+            gemm_int8: [$($gemm_int8:ty),*],
+            needs: [$($needed:ty),+],
+            $(gemm_f32: $gemm_f32:ty, gemm_widened: $gemm_widened:ty,)?
+            $(tiles: $tiles:ty,)?
+        }
+    )+) => {
+        /// An instruction set that the kernels are written for.
+        ///
+        /// ```
+        /// use saccade_vla_kernels::Isa;
+        /// assert!(Isa::available().contains(&Isa::best()));
+        /// assert_eq!("portable".parse::<Isa>().unwrap(), Isa::Portable);
+        /// ```
+        #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+        #[non_exhaustive]
+        pub enum Isa {
+            $($(#[$doc])* $isa,)+
+        }
+
+        const ALL: &[Isa] = &[$(Isa::$isa),+];
+
+        $(#[cfg($condition)] const _: () = Vectors::of::<<$vectors as Simd>::Vector>().check();)+
+
+        impl Isa {
+            fn name(self) -> &'static str {
+                match self {
+                    $(Self::$isa => $name,)+
+                }
+            }
+
+            /// Whether this CPU has it.
+            #[must_use]
+            #[inline]
+            pub fn is_available(self) -> bool {
+                match self {
+                    $(#[cfg($condition)] Self::$isa => ($(<$needed as Simd>::new().is_some())||+) $(&& <$tiles as TileUnit>::new().is_some())?,)+
+                    #[allow(unreachable_patterns, reason = "on some architectures all of them are there")]
+                    _ => false,
+                }
+            }
+
+            /// The instruction for `dot` that this instruction set uses on this CPU.
+            fn dot_product(self, dot: Dot) -> Option<&'static str> {
+                match self {
+                    $(#[cfg($condition)] Self::$isa if self.is_available() => match dot {
+                        Dot::Bf16 => None $(.or_else(name_of::<$bf16>))*,
+                        Dot::Int8 => None $(.or_else(name_of::<$int8>))*,
+                    },)+
+                    _ => None,
+                }
+            }
+
+            /// Sizes of its vectors.
+            ///
+            /// # Panics
+            /// If no CPU of this architecture has it.
+            pub(crate) fn vectors(self) -> Vectors {
+                match self {
+                    $(#[cfg($condition)] Self::$isa => Vectors::of::<<$vectors as Simd>::Vector>(),)+
+                    #[allow(unreachable_patterns, reason = "as above")]
+                    _ => self.is_missing(),
+                }
+            }
+
+            /// Runs a kernel on it, with the dot products that the kernel wants where there are any.
+            ///
+            /// # Panics
+            /// If this CPU lacks it: looking is a few loads, and makes every kernel sound.
+            #[inline]
+            pub(crate) fn run<K: Kernel>(self, kernel: K) -> K::Output {
+                match self {
+                    $(#[cfg($condition)] Self::$isa if self.is_available() => {
+                        match K::DOTS {
+                            None => {}
+                            Some(Dot::Bf16) => {
+                                $(if let Some(simd) = <$bf16 as Simd>::new() { return simd.run(kernel); })*
+                            }
+                            Some(Dot::Int8) => {
+                                $(if let Some(simd) = <$int8 as Simd>::new() { return simd.run(kernel); })*
+                            }
+                        }
+                        match <$vectors as Simd>::new() {
+                            Some(simd) => simd.run(kernel),
+                            None => self.is_missing(),
+                        }
+                    })+
+                    _ => self.is_missing(),
+                }
+            }
+
+            /// Whether attention over bfloat16 runs in tiles.
+            pub(crate) fn has_tiles(self) -> bool {
+                match self {
+                    $($(#[cfg($condition)] Self::$isa => <$tiles as TileUnit>::new().is_some(),)?)+
+                    _ => false,
+                }
+            }
+
+            /// Runs a kernel on its unit for tiles.
+            ///
+            /// # Panics
+            /// If it has none, or this CPU lacks it.
+            pub(crate) fn run_tiles<K: TileKernel>(self, kernel: K) -> K::Output {
+                match self {
+                    $($(#[cfg($condition)] Self::$isa => match <$tiles as TileUnit>::new() {
+                        Some(unit) => kernel.run(unit),
+                        None => self.is_missing(),
+                    },)?)+
+                    _ => self.is_missing(),
+                }
+            }
+
+            /// What multiplies rows by packed weights.
+            ///
+            /// # Panics
+            /// If this CPU lacks it.
+            pub(crate) fn gemm(self, product: Product) -> Box<dyn Gemm> {
+                let found: Option<Box<dyn Gemm>> = match self {
+                    $(#[cfg($condition)] Self::$isa if self.is_available() => match product {
+                        Product::Float32 => None $(.or_else(available::<$gemm_f32>))?
+                            .or_else(|| of_vectors_unless!([$($gemm_f32)?] Plain<$vectors>)),
+                        Product::WidenedBf16 => None $(.or_else(available::<$gemm_widened>))?
+                            .or_else(|| of_vectors_unless!([$($gemm_f32)?] Widened<$vectors>)),
+                        Product::Bf16 => None $(.or_else(available::<$gemm_bf16>))*
+                            .or_else(|| of_vectors_unless!([$($gemm_f32)?] RoundedRows<$vectors>)),
+                        Product::Int8 => None $(.or_else(available::<$gemm_int8>))*
+                            .or_else(|| of_vectors_unless!([$($gemm_f32)?] DotInt8<$vectors>)),
+                    },)+
+                    _ => None,
+                };
+                found.unwrap_or_else(|| self.is_missing())
+            }
+        }
+    };
+}
+
+instruction_sets! {
+    /// Plain loops that any compiler vectorises for its baseline; runs everywhere.
+    Portable = "portable" if all() {
+        vectors: Portable, bf16: [], int8: [], gemm_bf16: [], gemm_int8: [], needs: [Portable],
+    }
+    /// AVX2 with FMA.
+    Avx2 = "avx2" if target_arch = "x86_64" {
+        vectors: Avx2, bf16: [], int8: [], gemm_bf16: [], gemm_int8: [], needs: [Avx2],
+    }
+    /// AVX2 with 256-bit int8 dot products: AVX-VNNI, or AVX512-VNNI with VL.
+    Avx2Vnni = "avx2vnni" if target_arch = "x86_64" {
+        vectors: Avx2,
+        bf16: [],
+        int8: [Avx2VexVnni, Avx2EvexVnni],
+        gemm_bf16: [],
+        gemm_int8: [DotInt8<Avx2VexVnni>, DotInt8<Avx2EvexVnni>],
+        needs: [Avx2VexVnni, Avx2EvexVnni],
+    }
+    /// AVX-512 F, VL, BW and DQ, without dot products.
+    Avx512f = "avx512f" if target_arch = "x86_64" {
+        vectors: Avx512, bf16: [], int8: [], gemm_bf16: [], gemm_int8: [], needs: [Avx512],
+    }
+    /// AVX-512 with whichever of the dot products AVX512-BF16 and AVX512-VNNI this CPU has; [`Isa::Avx512f`] where it has neither.
+    Avx512 = "avx512" if target_arch = "x86_64" {
+        vectors: Avx512,
+        bf16: [Avx512Bf16],
+        int8: [Avx512Vnni],
+        gemm_bf16: [DotBf16<Avx512Bf16>],
+        gemm_int8: [DotInt8<Avx512Vnni>],
+        needs: [Avx512],
+    }
+    /// Tiles in software: what [`Isa::Amx`] computes, bit for bit but for the vectors beside the tiles, at the speed of an emulator. For
+    /// tests; never chosen, and not among [`Isa::available`].
+    #[doc(hidden)]
+    SoftwareTiles = "software_tiles" if all() {
+        vectors: Loops<TILE>,
+        bf16: [],
+        int8: [],
+        gemm_bf16: [InTiles<Software, Pairs>],
+        gemm_int8: [InTiles<Software, Quads>],
+        needs: [Loops<TILE>],
+        tiles: Software,
+    }
+    /// AVX-512, and products of bfloat16 and int8 in the tiles of AMX.
+    Amx = "amx" if target_arch = "x86_64" {
+        vectors: Avx512,
+        bf16: [Avx512Amx],
+        int8: [Avx512Vnni],
+        gemm_bf16: [InTiles<Amx, Pairs>],
+        gemm_int8: [InTiles<Amx, Quads>],
+        needs: [Avx512Amx],
+        tiles: Amx,
+    }
+    /// NEON, which every 64-bit ARM has.
+    Neon = "neon" if target_arch = "aarch64" {
+        vectors: Neon,
+        bf16: [],
+        int8: [],
+        gemm_bf16: [RoundedBf16],
+        gemm_int8: [Widening],
+        needs: [Neon],
+        gemm_f32: Float32,
+        gemm_widened: WidenedBf16,
+    }
+    /// NEON with dot products of int8.
+    Dotprod = "dotprod" if target_arch = "aarch64" {
+        vectors: Neon,
+        bf16: [],
+        int8: [NeonDotprod],
+        gemm_bf16: [RoundedBf16],
+        gemm_int8: [Sdot],
+        needs: [NeonDotprod],
+        gemm_f32: Float32,
+        gemm_widened: WidenedBf16,
+    }
+    /// NEON with products of matrices of int8.
+    I8mm = "i8mm" if target_arch = "aarch64" {
+        vectors: Neon,
+        bf16: [],
+        int8: [NeonI8mm],
+        gemm_bf16: [RoundedBf16],
+        gemm_int8: [Usmmla],
+        needs: [NeonI8mm],
+        gemm_f32: Float32,
+        gemm_widened: WidenedBf16,
+    }
+    /// NEON with products of bfloat16, and whichever of int8 this CPU has.
+    Bf16 = "bf16" if target_arch = "aarch64" {
+        vectors: Neon,
+        bf16: [NeonBf16],
+        int8: [NeonI8mm, NeonDotprod],
+        gemm_bf16: [Bfmmla],
+        gemm_int8: [Usmmla, Sdot, Widening],
+        needs: [NeonBf16],
+        gemm_f32: Float32,
+        gemm_widened: WidenedBf16,
+    }
+}
+
+/// What users call the instructions of `S`, where this CPU has them.
+fn name_of<S: Simd>() -> Option<&'static str> {
+    S::new().map(|_| <S::Dots as Dots<S::Vector>>::NAME)
+}
+
+/// Sizes that data are laid out by.
+#[derive(Clone, Copy)]
+pub(crate) struct Vectors {
+    /// f32 in a vector.
+    pub lanes: usize,
+    /// Rows of the largest tile of sums in registers.
+    pub tile_rows: usize,
+}
+
+impl Vectors {
+    const fn of<V: Vector>() -> Self {
+        Self {
+            lanes: V::LANES,
+            tile_rows: V::TILE_ROWS,
+        }
+    }
+
+    /// That kernels have room for them.
+    const fn check(&self) {
+        assert!(self.lanes <= MAX_LANES && self.tile_rows >= 1 && self.tile_rows <= MAX_TILE_ROWS);
+    }
+}
+
+/// `SACCADE_ISA` holds a name that is unknown, or of an instruction set that this CPU lacks or the system keeps from this process.
+#[derive(Debug, thiserror::Error)]
+#[error("{ISA_VARIABLE}: expected one of {}, got `{given}`{why}", names(&Isa::available()))]
+pub struct IsaError {
+    given: String,
+    /// Why not, from a comma on; empty where the name is unknown.
+    why: String,
+}
+
+impl Isa {
+    /// The fastest one that this CPU has.
+    #[must_use]
+    pub fn best() -> Self {
+        *Self::available().last().expect("portable is always there")
+    }
+
+    /// All that this CPU has, slowest first.
+    #[must_use]
+    pub fn available() -> Vec<Self> {
+        ALL.iter()
+            .copied()
+            .filter(|&isa| isa != Self::SoftwareTiles && isa.is_available())
+            .collect()
+    }
+
+    /// The dot products that it uses on this CPU: `bf16` (of bfloat16); `vnni`, `dotprod` or `i8mm` (of int8); in tiles, for [`Isa::Amx`].
+    ///
+    /// ```
+    /// assert!(saccade_vla_kernels::Isa::Portable.dot_products().is_empty());
+    /// ```
+    #[must_use]
+    pub fn dot_products(self) -> Vec<&'static str> {
+        let dots = [Dot::Bf16, Dot::Int8].into_iter();
+        dots.filter_map(|dot| self.dot_product(dot)).collect()
+    }
+
+    /// The one that `SACCADE_ISA` names; the best where it is unset or empty.
+    ///
+    /// # Errors
+    /// The name is unknown, or this CPU lacks the instruction set.
+    pub fn from_env() -> Result<Self, IsaError> {
+        match std::env::var_os(ISA_VARIABLE) {
+            Some(given) if !given.is_empty() => {
+                let given = given.to_string_lossy();
+                let isa: Self = given.parse()?;
+                if isa.is_available() {
+                    Ok(isa)
+                } else {
+                    Err(IsaError {
+                        given: given.into_owned(),
+                        why: isa.why_not(),
+                    })
+                }
+            }
+            _ => Ok(Self::best()),
+        }
+    }
+
+    /// Why it is not available.
+    fn why_not(self) -> String {
+        match (self, permission()) {
+            (Self::Amx, Err(refusal)) if refusal != Refusal::NotThere => format!(": {refusal}"),
+            _ => ", which this CPU lacks".to_owned(),
+        }
+    }
+
+    /// Panics unless this CPU has it.
+    pub(crate) fn check(self) {
+        if !self.is_available() {
+            self.is_missing();
+        }
+    }
+
+    #[cold]
+    fn is_missing(self) -> ! {
+        panic!("this CPU lacks {self}")
+    }
+}
+
+impl fmt::Display for Isa {
+    fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
+        formatter.write_str(self.name())
+    }
+}
+
+impl FromStr for Isa {
+    type Err = IsaError;
+
+    fn from_str(name: &str) -> Result<Self, IsaError> {
+        let known = ALL.iter().copied().find(|isa| isa.name() == name);
+        known.ok_or_else(|| IsaError {
+            given: name.to_owned(),
+            why: String::new(),
+        })
+    }
+}
+
+fn names(isas: &[Isa]) -> String {
+    isas.iter().map(Isa::to_string).collect::<Vec<_>>().join(", ")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_name_is_that_of_one_instruction_set() {
+        for &isa in ALL {
+            assert_eq!(isa.to_string().parse::<Isa>().unwrap(), isa);
+        }
+        let error = "avx1024".parse::<Isa>().unwrap_err().to_string();
+        assert!(
+            error.starts_with("SACCADE_ISA: expected one of portable"),
+            "{error}"
+        );
+        assert!(error.ends_with("got `avx1024`"), "{error}");
+    }
+}

@@ -1,0 +1,463 @@
+//! The packed linear layer: `out = epilogue(x W^T + bias)` with weights packed once.
+//!
+//! A [`Gemm`] packs the weights in panels of output columns, converts rows where it has to, and makes the sums of a block of rows and a
+//! panel. This module splits the work over blocks and panels, never over the summed dimension, and finishes the sums. So an output's bits
+//! depend on its row, its weights and the instruction set only: neither on the number of rows nor on how the work is split.
+
+mod epilogue;
+mod error;
+mod order;
+mod pack;
+mod rows;
+
+use std::mem::MaybeUninit;
+use std::ops::Range;
+
+use crate::aligned::{AlignedBuffer, AllocError, elements};
+use crate::cpu::Cpu;
+use crate::gemm::outliers::{MultiplyOutliers, Outliers};
+use crate::gemm::{Block, Gemm, MAX_COLUMNS, MAX_SUMS, Product, Quantized, Tiles};
+use crate::isa::Isa;
+use crate::parts::part;
+use crate::pool::{parallel_for, usable};
+use crate::rows::{Rows, RowsMut};
+use crate::weights::{Arithmetic, Element, WeightRef};
+pub use epilogue::Epilogue;
+use epilogue::{Finish, Int8};
+pub use error::KernelError;
+use error::MAX_INT8_INPUTS;
+use order::Order;
+use pack::{Panels, pack_panels};
+use rows::Conversion;
+pub use rows::LinearScratch;
+
+/// A linear layer whose weights were packed for one instruction set.
+///
+/// ```
+/// use saccade_vla_kernels::{Arithmetic, Epilogue, Isa, LinearScratch, Matrix, PackedLinear, Rows, RowsMut, WeightRef};
+///
+/// let weight = [1.0, 2.0, 3.0, 4.0, 5.0, 6.0]; // (out_features 3, in_features 2)
+/// let weight = WeightRef::F32(Matrix::new(&weight, 2));
+/// let parts = [(weight, Some(&[0.0, 0.0, 10.0][..]))];
+/// let layer = PackedLinear::pack(Isa::best(), Arithmetic::Float32, 1, &parts).unwrap();
+///
+/// let mut out = [0.0; 3];
+/// let x = Rows::new(&[1.0, 1.0], 2);
+/// layer.apply(1, x, Epilogue::Store, RowsMut::new(&mut out, 3), &mut LinearScratch::new()).unwrap();
+/// assert_eq!(out, [3.0, 7.0, 21.0]);
+/// ```
+pub struct PackedLinear {
+    isa: Isa,
+    gemm: Box<dyn Gemm>,
+    arithmetic: Arithmetic,
+    element: Element,
+    in_features: usize,
+    out_features: usize,
+    panels: Panels,
+    /// One for each column of the panels, zero in the padding.
+    bias: AlignedBuffer<f32>,
+    /// Whether memory is asked for them as many streams.
+    streams: bool,
+    /// Whether the largest elements of a row are kept out of its quantisation.
+    keeps_outliers: bool,
+}
+
+/// Below this many multiply-accumulates a second thread costs more than it saves: waking one takes about 5 us, in which a core does
+/// about 250 k of them.
+const MACS_FOR_THREADS: usize = 1 << 19;
+
+/// As many multiply-accumulates should each thread have, for the same reason.
+const MACS_OF_THREAD: usize = MACS_FOR_THREADS / 2;
+
+/// A task has at least so many: a microsecond of work, against a tenth of one to deal it.
+const MACS_OF_TASK: usize = 1 << 16;
+
+/// Tasks that each thread should have, if they are not smaller than that: one that begins its last task late keeps the others waiting for a
+/// quarter of the work at most.
+const TASKS_PER_THREAD: usize = 4;
+
+impl PackedLinear {
+    /// Packs `parts`, stacked along `out_features`, on `threads` threads; a missing bias is zero.
+    ///
+    /// For [`Arithmetic::Float32`] stored as bf16 only if every part is bf16; otherwise widened to f32, which is exact but for int8.
+    ///
+    /// # Errors
+    /// [`KernelError`] if there is no part, the parts do not fit together, there are more than 65536 `in_features` for int8, there is not
+    /// enough memory, or packing was interrupted.
+    ///
+    /// # Panics
+    /// If this CPU lacks `isa`.
+    pub fn pack(
+        isa: Isa,
+        arithmetic: Arithmetic,
+        threads: usize,
+        parts: &[(WeightRef<'_>, Option<&[f32]>)],
+    ) -> Result<Self, KernelError> {
+        isa.check();
+        let in_features = parts.first().ok_or(KernelError::NoParts)?.0.shape().1;
+        let mut out_features = 0_usize;
+        for (weight, bias) in parts {
+            let (outputs, inputs) = weight.shape();
+            if inputs != in_features {
+                return Err(KernelError::InFeatures {
+                    expected: in_features,
+                    given: inputs,
+                });
+            }
+            if let Some(bias) = bias
+                && bias.len() != outputs
+            {
+                return Err(KernelError::Bias {
+                    expected: outputs,
+                    given: bias.len(),
+                });
+            }
+            if let WeightRef::Int8 { scales, .. } = weight
+                && scales.len() != outputs
+            {
+                return Err(KernelError::Scales {
+                    expected: outputs,
+                    given: scales.len(),
+                });
+            }
+            out_features = out_features
+                .checked_add(outputs)
+                .filter(|&sum| sum <= isize::MAX as usize)
+                .ok_or(AllocError { bytes: usize::MAX })?;
+        }
+        let are_bf16 = parts
+            .iter()
+            .all(|(weight, _)| matches!(weight, WeightRef::Bf16(_)));
+        let (product, element) = product_of(arithmetic, are_bf16, in_features)?;
+        let gemm = isa.gemm(product);
+        check_panel(in_features)?;
+        let columns = gemm.shape().columns;
+        let mut bias = AlignedBuffer::zeroed(out_features.next_multiple_of(columns))?;
+        let mut column = 0;
+        for (weight, part) in parts {
+            if let Some(part) = part {
+                bias[column..column + part.len()].copy_from_slice(part);
+            }
+            column += weight.shape().0;
+        }
+        let panels = pack_panels(threads, &*gemm, product == Product::Int8, parts)?;
+        Ok(Self {
+            isa,
+            gemm,
+            arithmetic,
+            element,
+            in_features,
+            out_features,
+            panels,
+            bias,
+            streams: Cpu::current().wants_streams(),
+            keeps_outliers: false,
+        })
+    }
+
+    /// Asks memory for the weights as many streams, or in their order, instead of as was measured to be faster on this family of CPUs. For
+    /// programs that measure it: results have the same bits. Panels whose steps are one cache line (AVX2, narrow portable vectors) are asked
+    /// for in their order either way, and so are those of NEON.
+    #[must_use]
+    pub fn with_streams(self, streams: bool) -> Self {
+        Self { streams, ..self }
+    }
+
+    /// The layer, keeping up to 8 elements of a row out of its quantisation if they are far larger than the others: they are multiplied in
+    /// float32 by the same weights. For [`Arithmetic::Int8`]; no other arithmetic needs it.
+    ///
+    /// Costs a pass over the rows, and for rows that have such elements some percent of the products.
+    #[must_use]
+    pub fn keeping_outliers(self) -> Self {
+        Self {
+            keeps_outliers: self.element == Element::Int8,
+            ..self
+        }
+    }
+
+    /// The bytes that a layer of `(out_features, in_features)` holds when it is packed; `usize::MAX` for more than that. `weights` is [`Element::Bf16`] if all its parts are
+    /// bf16; every other element is packed as [`Element::F32`] is.
+    ///
+    /// # Errors
+    /// [`KernelError::TooManyInputs`] as [`Self::pack`].
+    ///
+    /// # Panics
+    /// If this CPU lacks `isa`.
+    pub fn packed_nbytes(
+        isa: Isa,
+        arithmetic: Arithmetic,
+        weights: Element,
+        (out_features, in_features): (usize, usize),
+    ) -> Result<usize, KernelError> {
+        let (product, _) = product_of(arithmetic, weights == Element::Bf16, in_features)?;
+        if check_panel(in_features).is_err() {
+            return Ok(usize::MAX);
+        }
+        let gemm = isa.gemm(product);
+        let columns = gemm.shape().columns;
+        // A bias for each column; for int8 also a scale and a sum.
+        let words_of_column = if product == Product::Int8 { 3 } else { 1 };
+        let panel = gemm
+            .panel_words(in_features)
+            .saturating_add(columns * words_of_column);
+        let words = out_features.div_ceil(columns).saturating_mul(panel);
+        Ok(words.saturating_mul(size_of::<u32>()))
+    }
+
+    /// Width of the input rows.
+    #[must_use]
+    pub fn in_features(&self) -> usize {
+        self.in_features
+    }
+
+    /// Width of the output rows.
+    #[must_use]
+    pub fn out_features(&self) -> usize {
+        self.out_features
+    }
+
+    /// How the weights are stored.
+    #[must_use]
+    pub fn element(&self) -> Element {
+        self.element
+    }
+
+    /// How it multiplies.
+    #[must_use]
+    pub fn arithmetic(&self) -> Arithmetic {
+        self.arithmetic
+    }
+
+    /// The instruction set that it was packed for.
+    #[must_use]
+    pub fn isa(&self) -> Isa {
+        self.isa
+    }
+
+    /// Bytes held.
+    #[must_use]
+    pub fn nbytes(&self) -> usize {
+        let Panels { words, scales, sums } = &self.panels;
+        4 * (words.len() + self.bias.len() + scales.len() + sums.len())
+    }
+
+    /// `out = epilogue(x W^T + bias)` for rows `x (rows, in_features)` and `out (rows, out_features)`, both row-major with any row stride.
+    ///
+    /// For [`Arithmetic::Bfloat16`] and [`Arithmetic::Int8`] the rows are converted first, into `scratch`. A row with NaN or infinity gives NaN
+    /// for int8.
+    ///
+    /// # Errors
+    /// [`AllocError`] if `scratch` has to grow and there is not enough memory.
+    ///
+    /// # Panics
+    /// If a shape does not fit.
+    pub fn apply(
+        &self,
+        threads: usize,
+        x: Rows<'_>,
+        epilogue: Epilogue,
+        mut out: RowsMut<'_>,
+        scratch: &mut LinearScratch,
+    ) -> Result<(), AllocError> {
+        let rows = x.num_rows();
+        assert_eq!(
+            x.num_columns(),
+            self.in_features,
+            "x: expected in_features columns"
+        );
+        assert_eq!(
+            (out.num_rows(), out.num_columns()),
+            (rows, self.out_features),
+            "out: expected (rows, out_features)"
+        );
+        if rows == 0 || self.out_features == 0 {
+            return Ok(());
+        }
+        let macs = rows
+            .saturating_mul(self.in_features)
+            .saturating_mul(self.out_features);
+        let threads = if macs < MACS_FOR_THREADS {
+            1
+        } else {
+            usable(threads).min(macs / MACS_OF_THREAD)
+        };
+        let shape = self.gemm.shape();
+        let columns = shape.columns;
+        let num_panels = self.out_features.div_ceil(columns);
+        let tiles = Tiles::new(rows, shape);
+        // More blocks than the rows need where panels are few, so that no thread waits long for the last task of another: 49 x 128 x 128 has
+        // three panels of 48 columns, which two threads would take in the time of two.
+        let wanted = (TASKS_PER_THREAD * threads)
+            .div_ceil(num_panels)
+            .min(macs / (num_panels * MACS_OF_TASK));
+        let most = tiles.count.min(if threads == 1 { 1 } else { wanted.max(1) });
+        let blocks = rows.div_ceil(self.gemm.row_block(self.in_features)).max(most);
+        let mut call = Call {
+            x: x.as_ptr().cast(),
+            x_stride: x.row_stride() as isize,
+            tiles,
+            quantized: &[],
+            outliers: &[],
+            out_stride: out.row_stride() as isize,
+            out: out.as_mut_ptr(),
+            epilogue,
+        };
+        if let Some(stride) = self.gemm.converted_stride(self.in_features) {
+            let conversion = match (self.element, self.keeps_outliers) {
+                (Element::Int8, true) => Conversion::QuantizedWithoutOutliers,
+                (Element::Int8, false) => Conversion::Quantized,
+                _ => Conversion::Rounded,
+            };
+            let converted = scratch.convert(&*self.gemm, stride, conversion, threads, x)?;
+            (call.x, call.x_stride) = (converted.words, stride as isize);
+            (call.quantized, call.outliers) = (converted.quantized, converted.outliers);
+        }
+        let panel_bytes = size_of::<u32>() * self.gemm.panel_words(self.in_features);
+        let order = Order::new(blocks, num_panels, panel_bytes, threads, TASKS_PER_THREAD);
+        parallel_for(threads, order.tasks(), &|task| {
+            let (block, panel) = order.at(task);
+            let range = part(tiles.count, block, blocks);
+            self.run_panel(&call, range, columns, panel, order.ahead(task));
+        });
+        Ok(())
+    }
+
+    /// Runs the tiles in `range` through panel number `panel`; this thread will probably take the one `ahead` of it next.
+    fn run_panel(&self, call: &Call<'_>, range: Range<usize>, columns: usize, panel: usize, ahead: usize) {
+        #[repr(align(64))]
+        struct SumBuffer([MaybeUninit<u32>; MAX_SUMS]);
+
+        let size = self.gemm.panel_words(self.in_features);
+        let first = panel * columns;
+        let rows = call.tiles.first_row(range.start)..call.tiles.first_row(range.end);
+        assert!(
+            rows.len() <= MAX_SUMS / columns,
+            "a block of {} rows and {columns} columns",
+            rows.len()
+        );
+        let mut sums = SumBuffer([const { MaybeUninit::uninit() }; MAX_SUMS]);
+        let sums = sums.0.as_mut_ptr().cast::<u32>();
+        let out = call.out.wrapping_add(first);
+        let weights = &self.panels.words[panel * size..][..size];
+        let finish = |done: Range<usize>| {
+            let sums = sums.wrapping_add((done.start - rows.start) * columns);
+            // SAFETY: the product calls this with rows of the block whose needed sums are complete.
+            unsafe { self.finish(call, done, panel, weights, sums) };
+        };
+        let block = Block {
+            x: call.x,
+            x_stride: call.x_stride,
+            in_features: self.in_features,
+            tiles: call.tiles,
+            range,
+            weights,
+            // The results are made in whole vectors.
+            needed: self
+                .panel_width(panel)
+                .next_multiple_of(self.isa.vectors().lanes)
+                .min(columns),
+            ahead,
+            streams: self.streams,
+            sums,
+            out,
+            out_stride: call.out_stride,
+            finish: &finish,
+        };
+        // SAFETY: the product has packed the panel and, where it does so, converted the rows; the block's sums fit.
+        unsafe { self.gemm.multiply(&block) };
+    }
+
+    /// Columns of panel number `panel` that the layer has.
+    fn panel_width(&self, panel: usize) -> usize {
+        let columns = self.gemm.shape().columns;
+        columns.min(self.out_features - panel * columns)
+    }
+
+    /// Makes results of the sums of some rows and panel number `panel`, whose words are `weights`.
+    ///
+    /// # Safety
+    /// `sums` points to the sums of these rows, which are in the call; those of [`Block::needed`] columns are complete.
+    unsafe fn finish(
+        &self,
+        call: &Call<'_>,
+        rows: Range<usize>,
+        panel: usize,
+        weights: &[u32],
+        sums: *const u32,
+    ) {
+        let columns = self.gemm.shape().columns;
+        let first = panel * columns;
+        let outliers = call.outliers.get(rows.clone()).unwrap_or_default();
+        let has_outliers = outliers.iter().any(|outliers| !outliers.is_empty());
+        let mut apart = [const { MaybeUninit::uninit() }; MAX_SUMS];
+        if has_outliers {
+            self.gemm.multiply_outliers(MultiplyOutliers {
+                outliers,
+                panel: weights,
+                columns,
+                run: 1,
+                sums: &mut apart[..rows.len() * columns],
+            });
+        }
+        let columns_of = first..first + columns;
+        self.isa.run(&Finish {
+            epilogue: call.epilogue,
+            sums,
+            columns,
+            rows,
+            width: self.panel_width(panel),
+            bias: &self.bias[columns_of.clone()],
+            int8: Int8 {
+                scales: self.panels.scales.get(columns_of.clone()).unwrap_or_default(),
+                sums: self.panels.sums.get(columns_of).unwrap_or_default(),
+                quantized: call.quantized,
+                outliers,
+                apart: has_outliers.then_some(&apart[..]),
+            },
+            out: call.out.wrapping_add(first),
+            out_stride: call.out_stride,
+        });
+    }
+}
+
+/// Checks that memory can have a panel, and a converted row, of `in_features`: every [`Gemm`] multiplies and pads their sizes without checks.
+fn check_panel(in_features: usize) -> Result<(), AllocError> {
+    // More than any product pads a row to.
+    let padded = in_features.checked_next_multiple_of(1024);
+    let padded = padded.ok_or(AllocError { bytes: usize::MAX })?;
+    elements(padded, MAX_COLUMNS * size_of::<u32>()).map(drop)
+}
+
+/// What multiplies weights, which `are_bf16` or are not, and the elements that they are packed as.
+fn product_of(
+    arithmetic: Arithmetic,
+    are_bf16: bool,
+    in_features: usize,
+) -> Result<(Product, Element), KernelError> {
+    match arithmetic {
+        Arithmetic::Float32 if are_bf16 => Ok((Product::WidenedBf16, Element::Bf16)),
+        Arithmetic::Float32 => Ok((Product::Float32, Element::F32)),
+        Arithmetic::Bfloat16 => Ok((Product::Bf16, Element::Bf16)),
+        Arithmetic::Int8 if in_features > MAX_INT8_INPUTS => {
+            Err(KernelError::TooManyInputs { given: in_features })
+        }
+        Arithmetic::Int8 => Ok((Product::Int8, Element::Int8)),
+    }
+}
+
+/// The activations and results of one call, as raw parts that tasks write to at the same time.
+struct Call<'a> {
+    /// As [`Block::x`].
+    x: *const u32,
+    x_stride: isize,
+    tiles: Tiles,
+    quantized: &'a [Quantized],
+    /// Of each row, if they are kept apart.
+    outliers: &'a [Outliers],
+    out: *mut f32,
+    out_stride: isize,
+    epilogue: Epilogue,
+}
+
+// SAFETY: tasks read `x` and write disjoint parts of `out`: no two have a block of rows and a panel in common.
+unsafe impl Sync for Call<'_> {}

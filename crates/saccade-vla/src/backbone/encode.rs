@@ -1,0 +1,457 @@
+//! Encoding prompts: views through the tower, then the rows of all prompts together through the language model.
+
+use std::ops::Range;
+use std::sync::Arc;
+
+use saccade_vla_kernels::{Epilogue, PackedKeyValues};
+
+use super::features::{BackboneFeatures, BackboneRecord, EncodedPrompt, View};
+use super::inputs::{BackboneInputs, Checked, Prompt, ViewPixels};
+use super::model::{Backbone, BackboneBuffers};
+use super::positions::{language_turns, token_positions};
+use super::prefix::{longest_prefix, same_view};
+use super::qwen3::{Additions, NewRows};
+use crate::alloc::{collected, filled, product, reserve, sized};
+use crate::array::{Array, OwnedArray};
+use crate::error::{Error, Result};
+use crate::nn::rotary::Rotation;
+use crate::ops::{first_keys_values, room_for_keys_values};
+
+/// Rows of the language model that are computed together. More read the weights less often; fewer keep the activations small: at 2048 rows
+/// the weights are read once for 7 prompts of one view, and the largest buffer is 50 MB at the released size.
+const LANGUAGE_ROWS: usize = 2048;
+
+/// What to keep of a call for looking at.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[non_exhaustive]
+pub struct BackboneKeep {
+    /// The rows after each layer of the language model.
+    pub hidden: bool,
+    /// The patches after the vision tower.
+    pub vision: bool,
+    /// The tokens of each view.
+    pub image_tokens: bool,
+}
+
+impl BackboneKeep {
+    /// With or without the rows after each layer of the language model.
+    #[must_use]
+    pub fn with_hidden(self, hidden: bool) -> Self {
+        Self { hidden, ..self }
+    }
+
+    /// With or without the patches after the vision tower.
+    #[must_use]
+    pub fn with_vision(self, vision: bool) -> Self {
+        Self { vision, ..self }
+    }
+
+    /// With or without the tokens of each view.
+    #[must_use]
+    pub fn with_image_tokens(self, image_tokens: bool) -> Self {
+        Self { image_tokens, ..self }
+    }
+}
+
+/// A prompt on its way.
+struct Sequence<'a> {
+    prompt: &'a Prompt<'a>,
+    views: Vec<Arc<View>>,
+    /// Where it begins in the same way, and the number of tokens that are the same.
+    known: Option<(&'a Arc<EncodedPrompt>, usize)>,
+    positions: Vec<[usize; 3]>,
+    /// Of which inputs, and which of their prompts.
+    place: [usize; 2],
+}
+
+impl Sequence<'_> {
+    /// The first row that is computed.
+    fn first(&self) -> usize {
+        self.known.map_or(0, |(_, len)| len)
+    }
+
+    fn num_rows(&self) -> usize {
+        self.prompt.ids.len() - self.first()
+    }
+}
+
+impl Backbone {
+    /// Encodes prompts. Each has the bits that it has alone: several inputs share the reading of the weights, and their prompts may be of
+    /// different lengths.
+    ///
+    /// From `previous`, features that this backbone made, views with the same pixels are taken, and the rows, keys and values of tokens at the
+    /// beginning of a prompt that are the same. The result has the same bits without. Where something is recorded, all of it is computed.
+    ///
+    /// # Errors
+    /// [`Error::Shape`] and [`Error::Input`] for inputs that do not fit, features of another backbone, and a result that is not finite;
+    /// [`Error::Memory`].
+    pub fn encode(
+        &self,
+        inputs: &[BackboneInputs<'_>],
+        previous: &[&BackboneFeatures],
+        keep: BackboneKeep,
+    ) -> Result<Vec<BackboneFeatures>> {
+        if previous.iter().any(|features| features.backbone != self.id) {
+            return Err(Error::Input(
+                "previous: expected features that this backbone made, got those of another backbone"
+                    .to_owned(),
+            ));
+        }
+        let previous = if keep == BackboneKeep::default() {
+            previous
+        } else {
+            &[]
+        };
+        let checked: Vec<Checked<'_>> = inputs
+            .iter()
+            .map(|inputs| Checked::new(&self.config, inputs))
+            .collect::<Result<_>>()?;
+        self.with_buffers(|buffers| {
+            let views = self.views(&checked, previous, keep.vision, buffers)?;
+            let sequences = self.sequences(&checked, views, previous)?;
+            let mut results = checked
+                .iter()
+                .map(|inputs| self.empty(inputs, keep))
+                .collect::<Result<Vec<_>>>()?;
+            let mut left = &sequences[..];
+            while !left.is_empty() {
+                let mut rows = 0;
+                let together = left.iter().take_while(|sequence| {
+                    rows += sequence.num_rows();
+                    rows <= LANGUAGE_ROWS
+                });
+                let (group, rest) = left.split_at(together.count().max(1));
+                left = rest;
+                let encoded = self.encode_group(group, &mut results, buffers)?;
+                for (sequence, encoded) in group.iter().zip(encoded) {
+                    let [input, _] = sequence.place;
+                    let result = &mut results[input];
+                    record_views(&encoded, keep, self.config.vision.width, &mut result.recorded)?;
+                    result.prompts.push(encoded);
+                }
+            }
+            Ok(results)
+        })
+    }
+
+    /// The views of each of the inputs: taken from `previous`, or encoded, those of all inputs together.
+    fn views(
+        &self,
+        inputs: &[Checked<'_>],
+        previous: &[&BackboneFeatures],
+        record: bool,
+        buffers: &mut BackboneBuffers,
+    ) -> Result<Vec<Vec<Arc<View>>>> {
+        let mut found: Vec<Vec<Option<Arc<View>>>> = Vec::new();
+        let mut new: Vec<ViewPixels<'_>> = Vec::new();
+        let count = inputs.iter().map(|inputs| inputs.views.len()).sum();
+        reserve("views", &mut new, count)?;
+        let mut number = 0;
+        for inputs in inputs {
+            let mut of_inputs = Vec::new();
+            reserve("views", &mut of_inputs, inputs.views.len())?;
+            for prompt in &inputs.prompts {
+                for (place, view) in inputs.views[prompt.views.clone()].iter().enumerate() {
+                    let same = same_view(previous, (number, place), view);
+                    if same.is_none() {
+                        new.push(*view);
+                    }
+                    of_inputs.push(same);
+                }
+                number += 1;
+            }
+            found.push(of_inputs);
+        }
+        let vision = &self.layers.vision;
+        let encoded = vision.encode(self.engine, &self.config, &new, record, &mut buffers.vision)?;
+        let mut encoded = encoded.into_iter();
+        let views = found.into_iter().map(|of_inputs| {
+            let one = |view: Option<Arc<View>>| view.or_else(|| encoded.next());
+            of_inputs.into_iter().filter_map(one).collect()
+        });
+        Ok(views.collect())
+    }
+
+    /// The prompts of all inputs, with what is known of them.
+    fn sequences<'a>(
+        &self,
+        inputs: &'a [Checked<'a>],
+        views: Vec<Vec<Arc<View>>>,
+        previous: &[&'a BackboneFeatures],
+    ) -> Result<Vec<Sequence<'a>>> {
+        let mut sequences = Vec::new();
+        let count = inputs.iter().map(|inputs| inputs.prompts.len()).sum();
+        reserve("prompts", &mut sequences, count)?;
+        for (index, (inputs, views)) in inputs.iter().zip(views).enumerate() {
+            for (row, prompt) in inputs.prompts.iter().enumerate() {
+                let views = views[prompt.views.clone()].to_vec();
+                let last = prompt.ids.len() - 1;
+                let known = longest_prefix(previous, prompt, &views);
+                sequences.push(Sequence {
+                    positions: token_positions(&self.config, prompt, &inputs.views)?,
+                    known: known.map(|(held, len)| match len == held.ids.len() && len > last {
+                        true => (held, len),
+                        // The last row is computed, so that there is one to compute.
+                        false => (held, len.min(last)),
+                    }),
+                    prompt,
+                    views,
+                    place: [index, row],
+                });
+            }
+        }
+        Ok(sequences)
+    }
+
+    /// What is returned for inputs, with room for what is recorded.
+    fn empty(&self, inputs: &Checked<'_>, keep: BackboneKeep) -> Result<BackboneFeatures> {
+        let mut recorded = BackboneRecord::default();
+        if keep.hidden {
+            let shape = [
+                inputs.prompts.len(),
+                inputs.num_tokens,
+                self.config.language.width,
+            ];
+            let len = product("record", &shape)?;
+            for _ in 0..self.config.language.num_layers {
+                recorded
+                    .hidden
+                    .push(OwnedArray::new(filled("record", len, 0.0)?, &shape)?);
+            }
+        }
+        let mut prompts = Vec::new();
+        reserve("prompts", &mut prompts, inputs.prompts.len())?;
+        Ok(BackboneFeatures {
+            backbone: self.id,
+            prompts,
+            num_tokens: inputs.num_tokens,
+            feature_dim: self.config.feature_dim(),
+            recorded,
+        })
+    }
+
+    /// Encodes some prompts together.
+    fn encode_group(
+        &self,
+        group: &[Sequence<'_>],
+        results: &mut [BackboneFeatures],
+        buffers: &mut BackboneBuffers,
+    ) -> Result<Vec<Arc<EncodedPrompt>>> {
+        let width = self.config.language.width;
+        let rows: usize = group.iter().map(Sequence::num_rows).sum();
+        let mut keys_values: Vec<Vec<PackedKeyValues>> = Vec::new();
+        let mut positions = Vec::new();
+        reserve("positions", &mut positions, rows)?;
+        for sequence in group {
+            positions.extend_from_slice(&sequence.positions[sequence.first()..]);
+            keys_values.push(match sequence.num_rows() {
+                0 => Vec::new(),
+                _ => self.keys_values(sequence)?,
+            });
+        }
+        sized(&mut buffers.language.x, rows * width)?;
+        let deepstack = self.embed(group, &mut buffers.language.x)?;
+        let turns = language_turns(&self.config);
+        let rotation = Rotation::new(self.config.language.head_dim, &turns, &positions)?;
+        if rows > 0 {
+            let mut prompts: Vec<NewRows<'_>> = group
+                .iter()
+                .zip(&mut keys_values)
+                .filter(|(sequence, _)| sequence.num_rows() > 0)
+                .map(|(sequence, keys_values)| NewRows {
+                    attended: &sequence.prompt.attended[sequence.first()..],
+                    keys_values,
+                })
+                .collect();
+            let keep = |layer: usize, x: &[f32]| {
+                record_hidden(group, layer, x, width, results);
+                Ok(())
+            };
+            let language = &self.layers.language;
+            language.run(
+                self.engine,
+                &rotation,
+                &mut prompts,
+                &deepstack,
+                &mut buffers.language,
+                keep,
+            )?;
+        }
+        self.collect(group, keys_values, buffers)
+    }
+
+    /// Keys and values by layer: those of the tokens that are known, with room for all.
+    fn keys_values(&self, sequence: &Sequence<'_>) -> Result<Vec<PackedKeyValues>> {
+        let language = &self.config.language;
+        let count = |attended: &[bool]| attended.iter().filter(|attended| **attended).count();
+        let capacity = count(&sequence.prompt.attended);
+        let known = count(&sequence.prompt.attended[..sequence.first()]);
+        (0..language.num_layers)
+            .map(|layer| match sequence.known {
+                Some((held, _)) => first_keys_values(&held.keys_values[layer], known, capacity),
+                None => {
+                    let heads = [language.num_kv_heads, language.head_dim];
+                    room_for_keys_values(self.engine, heads, capacity)
+                }
+            })
+            .collect()
+    }
+
+    /// Writes the tokens of words and views to `x (rows, width)`; what is added to them after the first layers.
+    fn embed<'a>(&self, group: &'a [Sequence<'_>], x: &mut [f32]) -> Result<Vec<Additions<'a>>> {
+        let width = self.config.language.width;
+        let mut deepstack: Vec<Additions<'a>> = vec![Vec::new(); self.config.vision.deepstack.len()];
+        let count = group
+            .iter()
+            .map(|sequence| sequence.prompt.image_tokens.len())
+            .sum();
+        for additions in &mut deepstack {
+            reserve("activations", additions, count)?;
+        }
+        let mut first_row = 0;
+        for sequence in group {
+            let first = sequence.first();
+            for (place, &id) in sequence.prompt.ids.iter().enumerate().skip(first) {
+                let row = (first_row + place - first) * width;
+                self.layers
+                    .embedding
+                    .look_up(id as usize, &mut x[row..row + width]);
+            }
+            let mut places = sequence.prompt.image_tokens.iter();
+            for view in &sequence.views {
+                for (token, &place) in places.by_ref().take(view.num_tokens).enumerate() {
+                    if place < first {
+                        continue;
+                    }
+                    let row = (first_row + place - first) * width;
+                    let token = token * width..(token + 1) * width;
+                    x[row..row + width].copy_from_slice(&view.tokens[token.clone()]);
+                    for (additions, rows) in deepstack.iter_mut().zip(&view.deepstack) {
+                        additions.push((row, &rows[token.clone()]));
+                    }
+                }
+            }
+            first_row += sequence.num_rows();
+        }
+        Ok(deepstack)
+    }
+
+    /// The features of rows that have passed the language model, and all that is held of their prompts.
+    fn collect(
+        &self,
+        group: &[Sequence<'_>],
+        keys_values: Vec<Vec<PackedKeyValues>>,
+        buffers: &mut BackboneBuffers,
+    ) -> Result<Vec<Arc<EncodedPrompt>>> {
+        let BackboneBuffers {
+            language, projected, ..
+        } = buffers;
+        let dim = self.config.feature_dim();
+        let finished = self
+            .layers
+            .language
+            .finish(self.engine, &language.x, &mut language.y)?;
+        let finished: &[f32] = match &self.layers.projection {
+            Some(layer) => {
+                let projected = sized(projected, finished.len() / self.config.language.width * dim)?;
+                layer.apply(
+                    self.engine,
+                    finished,
+                    Epilogue::Store,
+                    projected,
+                    &mut language.linear,
+                )?;
+                projected
+            }
+            None => finished,
+        };
+        let mut first = 0;
+        let mut encoded = Vec::new();
+        for (sequence, keys_values) in group.iter().zip(keys_values) {
+            let rows = first..first + sequence.num_rows();
+            first = rows.end;
+            encoded.push(match sequence.known {
+                Some((held, _)) if rows.is_empty() => Arc::clone(held),
+                _ => Arc::new(encoded_prompt(sequence, finished, rows, dim, keys_values)?),
+            });
+        }
+        Ok(encoded)
+    }
+}
+
+/// What is held of a prompt whose new features are `rows` of `finished (all rows, dim)`.
+fn encoded_prompt(
+    sequence: &Sequence<'_>,
+    finished: &[f32],
+    rows: Range<usize>,
+    dim: usize,
+    keys_values: Vec<PackedKeyValues>,
+) -> Result<EncodedPrompt> {
+    let Prompt {
+        ids,
+        attended,
+        image_tokens,
+        ..
+    } = sequence.prompt;
+    let mut features = Vec::new();
+    reserve("backbone_features", &mut features, ids.len() * dim)?;
+    if let Some((held, len)) = sequence.known {
+        features.extend_from_slice(&held.features[..len * dim]);
+    }
+    features.extend_from_slice(&finished[rows.start * dim..rows.end * dim]);
+    Array::new(&features, &[ids.len(), dim])?.check_result("backbone_features")?;
+    Ok(EncodedPrompt {
+        ids: collected("input_ids", ids.len(), ids.iter().copied())?,
+        attended: collected("attention_mask", ids.len(), attended.iter().copied())?,
+        views: sequence.views.clone(),
+        image_tokens: collected("image_mask", image_tokens.len(), image_tokens.iter().copied())?,
+        features,
+        keys_values,
+    })
+}
+
+/// Keeps the rows of a group after a layer, where that is asked for.
+fn record_hidden(
+    group: &[Sequence<'_>],
+    layer: usize,
+    x: &[f32],
+    width: usize,
+    results: &mut [BackboneFeatures],
+) {
+    let mut first = 0;
+    for sequence in group {
+        let [input, prompt] = sequence.place;
+        let rows = first..first + sequence.num_rows() * width;
+        first = rows.end;
+        if let Some(kept) = results[input].recorded.hidden.get_mut(layer) {
+            kept.data_mut()[prompt * rows.len()..][..rows.len()].copy_from_slice(&x[rows]);
+        }
+    }
+}
+
+/// Keeps the patches and tokens of a prompt's views, where that is asked for.
+fn record_views(
+    prompt: &EncodedPrompt,
+    keep: BackboneKeep,
+    vision_width: usize,
+    recorded: &mut BackboneRecord,
+) -> Result<()> {
+    let copies = |rows: &dyn Fn(&View) -> (&[f32], usize)| {
+        let copy = |view: &Arc<View>| {
+            let (rows, count) = rows(view);
+            let data = collected("record", rows.len(), rows.iter().copied())?;
+            OwnedArray::new(data, &[count, rows.len() / count])
+        };
+        prompt.views.iter().map(copy).collect::<Result<Vec<_>>>()
+    };
+    if keep.vision {
+        let of_prompt = copies(&|view| (&view.patches, view.patches.len() / vision_width))?;
+        recorded.vision.push(of_prompt);
+    }
+    if keep.image_tokens {
+        recorded
+            .image_tokens
+            .push(copies(&|view| (&view.tokens, view.num_tokens))?);
+    }
+    Ok(())
+}

@@ -1,0 +1,122 @@
+//! Loading a backbone: from a checkpoint, or from tensors in memory.
+
+use std::path::Path;
+
+use saccade_vla_checkpoint::granted;
+use saccade_vla_checkpoint::spec::Problem;
+
+use super::json::GivenConfig;
+use super::layers::BackboneLayers;
+use super::model::Backbone;
+use super::plan::plan;
+use super::published::PublishedBackbone;
+use super::recognise::Found;
+use crate::engine::Engine;
+use crate::error::{Error, Result};
+use crate::memory::{self, MemorySource, TensorViews};
+use crate::nn::file::FileSource;
+use crate::nn::weights::{Builder, Source};
+use crate::precision::Precision;
+
+/// How a backbone is loaded.
+///
+/// ```
+/// use saccade_vla::{BackboneLoadOptions, Precision};
+/// let options = BackboneLoadOptions::default().with_precision(Precision::Int8).with_num_threads(4);
+/// assert_eq!(options.num_threads, Some(4));
+/// ```
+#[derive(Clone, Debug, Default)]
+#[non_exhaustive]
+pub struct BackboneLoadOptions {
+    /// The config as JSON; default the `config.json` in the checkpoint's directory, if it is there.
+    pub config: Option<String>,
+    /// What is computed in what.
+    pub precision: Precision,
+    /// Threads that a call uses; default `SACCADE_NUM_THREADS`, or the physical cores that the process may use.
+    pub num_threads: Option<usize>,
+}
+
+impl BackboneLoadOptions {
+    /// With this config, as JSON.
+    #[must_use]
+    pub fn with_config(self, config: impl Into<Option<String>>) -> Self {
+        Self {
+            config: config.into(),
+            ..self
+        }
+    }
+
+    /// With this precision.
+    #[must_use]
+    pub fn with_precision(self, precision: Precision) -> Self {
+        Self { precision, ..self }
+    }
+
+    /// With this number of threads.
+    #[must_use]
+    pub fn with_num_threads(self, num_threads: impl Into<Option<usize>>) -> Self {
+        Self {
+            num_threads: num_threads.into(),
+            ..self
+        }
+    }
+}
+
+impl Backbone {
+    /// Loads a backbone from `source`: one `.safetensors` file, or a directory of one or more of them with a `config.json`.
+    ///
+    /// The version is that of the tensors. Sizes that the config does not hold are those of the published model.
+    ///
+    /// # Errors
+    /// [`Error::File`] for a path that is not there; [`Error::Checkpoint`] for a config or weights that are broken, not finite or do not
+    /// fit each other (all that does not fit is listed); [`Error::Input`] for options out of range; [`Error::Memory`].
+    pub fn load(source: &Path, options: &BackboneLoadOptions) -> Result<Self> {
+        let engine = Engine::new(options.precision, options.num_threads)?;
+        let published = PublishedBackbone::open(source, options.config.as_deref())?;
+        granted("source", published.nbytes_in(engine)?)?;
+        let PublishedBackbone {
+            checkpoint,
+            found,
+            plan,
+        } = published;
+        FileSource::read_ahead(&checkpoint, found.prefix, plan.wanted, |tensors| {
+            Self::build(tensors, engine, &found)
+        })
+    }
+
+    /// A backbone from `tensors` in memory, by their names in a checkpoint, with the config in `options`, or that of the published model: bit for
+    /// bit the backbone that [`Self::load`] reads from a file of them. The tensors are borrowed for the call only.
+    ///
+    /// # Errors
+    /// [`Error::Checkpoint`] for a broken config, for tensors that are missing or unknown, and for weights that are not finite;
+    /// [`Error::Shape`] if shapes alone are wrong (all that is wrong is listed in both); [`Error::Input`] for options out of range;
+    /// [`Error::Memory`].
+    pub fn from_tensors(tensors: &TensorViews<'_>, options: &BackboneLoadOptions) -> Result<Self> {
+        let engine = Engine::new(options.precision, options.num_threads)?;
+        let given = GivenConfig::parse(options.config.as_deref().unwrap_or("{}"))?;
+        let found = Found::new(tensors.keys().map(String::as_str), &given)?;
+        let plan = plan(&found)?;
+        let own = tensors.iter().filter_map(|(name, tensor)| {
+            let name = name.strip_prefix(found.prefix)?.to_owned();
+            Some((name, tensor.clone()))
+        });
+        let own: TensorViews<'_> = own.collect();
+        let problems = memory::problems(&own, &plan.specs, |name, _| found.is_unused(name));
+        if !problems.is_empty() {
+            let message = format!("tensors: {}", found.list(&problems));
+            let is_shape = |problem: &Problem| matches!(problem, Problem::Shape(_));
+            return Err(if problems.iter().all(is_shape) {
+                Error::Shape(message)
+            } else {
+                Error::Checkpoint(message)
+            });
+        }
+        Self::build(&MemorySource::new(&own), engine, &found)
+    }
+
+    fn build(source: &dyn Source, engine: Engine, found: &Found) -> Result<Self> {
+        let builder = Builder::new(source, engine);
+        let layers = BackboneLayers::new(&builder.weights(), &found.names, &found.config)?;
+        Ok(Self::new(found.config.clone(), engine, layers, builder.nbytes()))
+    }
+}

@@ -1,0 +1,93 @@
+//! A backbone in a checkpoint, before it is loaded: what it is, which tensors it has, how much memory it will need.
+
+use std::path::Path;
+
+use saccade_vla_checkpoint::{Checkpoint, TensorSpec, read_text};
+
+use super::config::BackboneConfig;
+use super::json::GivenConfig;
+use super::plan::{nbytes, plan};
+use super::recognise::Found;
+use crate::engine::Engine;
+use crate::error::{Error, Result};
+use crate::nn::planner::Plan;
+use crate::precision::Precision;
+
+/// A checkpoint with a backbone, open, whose tensors fit its config.
+pub struct PublishedBackbone {
+    pub(super) checkpoint: Checkpoint,
+    pub(super) found: Found,
+    pub(super) plan: Plan,
+}
+
+impl PublishedBackbone {
+    /// Opens `source`, one `.safetensors` file or a directory of them, with `config`, as JSON, or the `config.json` next to the weights, if
+    /// there is one. Reads no tensor.
+    ///
+    /// # Errors
+    /// [`Error::File`] for a path that is not there; [`Error::Checkpoint`] if there is no backbone, and for a config or tensors that are broken
+    /// or do not fit each other (all that does not fit is listed).
+    pub fn open(source: &Path, config: Option<&str>) -> Result<Self> {
+        let checkpoint = Checkpoint::open(source)?;
+        let given = match config {
+            Some(text) => GivenConfig::parse(text)?,
+            None => config_of(source)?,
+        };
+        let names: Vec<&str> = checkpoint.names().collect();
+        let found = Found::new(names.iter().copied(), &given)?;
+        let plan = plan(&found)?;
+        let is_unused = |name: &str, _: &[usize]| found.is_unused(name);
+        let problems = checkpoint.problems(found.prefix, &plan.specs, is_unused);
+        if !problems.is_empty() {
+            return Err(Error::Checkpoint(format!("source: {}", found.list(&problems))));
+        }
+        Ok(Self {
+            checkpoint,
+            found,
+            plan,
+        })
+    }
+
+    /// Its sizes and switches.
+    #[must_use]
+    pub fn config(&self) -> &BackboneConfig {
+        &self.found.config
+    }
+
+    /// What the names of its tensors begin with.
+    #[must_use]
+    pub fn prefix(&self) -> &'static str {
+        self.found.prefix
+    }
+
+    /// Bytes of the layers at a precision.
+    ///
+    /// # Errors
+    /// [`Error::Isa`] for an unknown instruction set in the environment; [`Error::Interrupted`].
+    pub fn nbytes(&self, precision: Precision) -> Result<usize> {
+        self.nbytes_in(Engine::new(precision, Some(1))?)
+    }
+
+    pub(super) fn nbytes_in(&self, engine: Engine) -> Result<usize> {
+        let dtype = |name: &str| Ok(self.checkpoint.dtype(&format!("{}{name}", self.found.prefix))?);
+        nbytes(&self.found, engine, dtype)
+    }
+
+    /// The tensors that are read, by their names without the prefix.
+    pub(crate) fn specs(&self) -> &[TensorSpec] {
+        &self.plan.specs
+    }
+}
+
+/// The config next to the weights; an empty one if there is none.
+fn config_of(source: &Path) -> Result<GivenConfig> {
+    let directory = match source.is_dir() {
+        true => source,
+        false => source.parent().unwrap_or(Path::new("")),
+    };
+    let path = directory.join("config.json");
+    match path.exists() {
+        true => GivenConfig::parse(&read_text("config", &path)?).map_err(|error| error.in_file(&path)),
+        false => GivenConfig::parse("{}"),
+    }
+}

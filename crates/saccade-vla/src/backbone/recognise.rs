@@ -1,0 +1,160 @@
+//! Where a backbone is in a checkpoint, of which release it is, and what its tensors are called.
+
+use saccade_vla_checkpoint::spec::{self, Problem};
+
+use super::config::BackboneConfig;
+use super::json::GivenConfig;
+use super::released::{Names, Release};
+use crate::error::{Error, Result};
+
+/// What the names of a backbone's tensors begin with: lerobot's checkpoints, NVIDIA's, a backbone alone.
+pub(super) const PREFIXES: [&str; 3] = ["_groot_model.backbone.", "backbone.", ""];
+
+/// What the tensors of a backbone are called, below the prefix.
+pub(super) struct TensorNames {
+    pub parts: Names,
+    /// The table of embeddings: its own name, or that of its twin where that alone was stored.
+    pub embedding: String,
+}
+
+/// A backbone in a list of tensors.
+pub(super) struct Found {
+    pub prefix: &'static str,
+    pub release: &'static Release,
+    pub names: TensorNames,
+    pub config: BackboneConfig,
+}
+
+impl Found {
+    /// The backbone among tensors of these names, with the config that was given for it.
+    ///
+    /// # Errors
+    /// [`Error::Checkpoint`] if there is none, if there are two, if the config is of another one, and as the config has them.
+    pub(super) fn new<'a>(names: impl Iterator<Item = &'a str> + Clone, given: &GivenConfig) -> Result<Self> {
+        let mut found: Vec<(&'static str, &'static Release)> = Vec::new();
+        for prefix in PREFIXES {
+            for release in Release::all() {
+                let marks = release.marks();
+                let is_own = |name: &str| {
+                    let name = name.strip_prefix(prefix);
+                    name.is_some_and(|name| marks.iter().any(|mark| name.starts_with(mark)))
+                };
+                if names.clone().any(is_own) {
+                    found.push((prefix, release));
+                }
+            }
+        }
+        let (prefix, release) = match found[..] {
+            [one] => one,
+            [] => return Err(nothing_found(names)),
+            [first, second, ..] => {
+                let show = |(prefix, release): (&str, &Release)| {
+                    format!("of GR00T {} under `{prefix}`", release.version.title())
+                };
+                return Err(Error::Checkpoint(format!(
+                    "source: two backbones in one checkpoint, {} and {}",
+                    show(first),
+                    show(second)
+                )));
+            }
+        };
+        if let Some((version, words)) = given.version()?
+            && version != release.version
+        {
+            return Err(Error::Checkpoint(format!(
+                "config: {words}, but the tensors are those of GR00T {}",
+                release.version.title()
+            )));
+        }
+        let config = given.read(release)?;
+        let own = format!("{}.embed_tokens", release.names.language);
+        let is_there = |name: &str| {
+            let name = format!("{prefix}{name}.weight");
+            names.clone().any(|other| other == name)
+        };
+        let has_twin_only = !is_there(&own) && is_there(release.names.lm_head);
+        Ok(Self {
+            prefix,
+            release,
+            names: TensorNames {
+                parts: release.names,
+                embedding: match has_twin_only {
+                    true => release.names.lm_head.to_owned(),
+                    false => own,
+                },
+            },
+            config,
+        })
+    }
+
+    /// Whether a checkpoint may hold a tensor `name`, without the prefix, that nothing of the backbone reads: the pooling head of SigLIP, the
+    /// twin of the embeddings, layers of the language model beyond the last one that is kept, and its norm where features are not normed.
+    pub(super) fn is_unused(&self, name: &str) -> bool {
+        let Names {
+            vision,
+            language,
+            lm_head,
+            ..
+        } = self.names.parts;
+        let below = |name: &str, path: &str| {
+            let rest = name.strip_prefix(path)?.strip_prefix('.')?;
+            Some(rest.to_owned())
+        };
+        if below(name, lm_head).as_deref() == Some("weight") {
+            return true;
+        }
+        if self.names.parts.connector.is_some()
+            && below(name, vision).is_some_and(|rest| rest.starts_with("head."))
+        {
+            return true;
+        }
+        let Some(rest) = below(name, language) else {
+            return false;
+        };
+        if rest == "norm.weight" {
+            return !self.config.language.has_final_norm;
+        }
+        let layer = rest
+            .strip_prefix("layers.")
+            .and_then(|rest| rest.split('.').next());
+        let layer = layer.and_then(|layer| layer.parse::<usize>().ok());
+        layer.is_some_and(|layer| layer >= self.config.language.num_layers)
+    }
+
+    /// All problems, one on a line.
+    pub(super) fn list(&self, problems: &[Problem]) -> String {
+        let what = format!("the backbone of GR00T {}", self.release.version.title());
+        spec::list(problems, &what)
+    }
+}
+
+/// The error for a checkpoint without a backbone.
+fn nothing_found<'a>(mut names: impl Iterator<Item = &'a str> + Clone) -> Error {
+    let count = names.clone().count();
+    let like = |prefix: &str| names.clone().find(|name| name.starts_with(prefix));
+    let other = PREFIXES
+        .iter()
+        .filter(|prefix| !prefix.is_empty())
+        .find_map(|prefix| like(prefix));
+    if let Some(name) = other {
+        let known: Vec<String> = Release::all()
+            .map(|release| format!("{} ({})", release.names.vision, release.version.title()))
+            .collect();
+        return Error::Checkpoint(format!(
+            "source: the backbone is of a model that is not known: it has {name}, expected names that begin with one of {}",
+            known.join(", ")
+        ));
+    }
+    let first = names
+        .next()
+        .map_or_else(String::new, |name| format!(", such as {name}"));
+    Error::Checkpoint(format!(
+        "source: there is no backbone among the {count} tensors{first}: expected names that begin with {}",
+        PREFIXES
+            .iter()
+            .filter(|prefix| !prefix.is_empty())
+            .map(|prefix| format!("`{prefix}`"))
+            .collect::<Vec<_>>()
+            .join(" or ")
+    ))
+}

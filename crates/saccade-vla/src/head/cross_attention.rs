@@ -1,0 +1,332 @@
+//! Cross-attention on its own: the layer in which state, future and action rows attend to the vision-language tokens.
+
+use std::sync::Mutex;
+
+use saccade_vla_kernels::{Activations, Epilogue, LinearScratch, PackedKeyValues};
+
+use crate::alloc::{collected, filled, product};
+use crate::array::{Array, ArrayMut};
+use crate::engine::Engine;
+use crate::error::{Error, Result, show_shape};
+use crate::memory::{self, MemorySource, TensorViews};
+use crate::nn::attention::{Attention, AttentionBuffers, Bias, CrossKeys};
+use crate::nn::planner::Planner;
+use crate::nn::weights::{Builder, Source};
+use crate::precision::Precision;
+use crate::profile::Part;
+use saccade_vla_checkpoint::spec;
+
+/// Projected keys and values of a batch: immutable, for any number of calls.
+pub struct KeyValues {
+    batch: usize,
+    num_vl_tokens: usize,
+    num_heads: usize,
+    width: usize,
+    packed: Vec<PackedKeyValues>,
+}
+
+impl KeyValues {
+    /// Sequences.
+    #[must_use]
+    pub fn batch(&self) -> usize {
+        self.batch
+    }
+
+    /// Keys of each.
+    #[must_use]
+    pub fn num_vl_tokens(&self) -> usize {
+        self.num_vl_tokens
+    }
+
+    /// Bytes held.
+    #[must_use]
+    pub fn nbytes(&self) -> usize {
+        self.packed.iter().map(PackedKeyValues::nbytes).sum()
+    }
+}
+
+/// `to_out(softmax(to_q(x) to_k(c)^T / sqrt(head_dim)) to_v(c))`.
+pub struct CrossAttention {
+    attention: Attention,
+    engine: Engine,
+    num_heads: usize,
+    context_dim: usize,
+    nbytes: usize,
+    buffers: Mutex<Vec<AttentionBuffers>>,
+}
+
+/// Which keys count, and how much.
+#[derive(Clone, Copy, Debug, Default)]
+#[non_exhaustive]
+pub struct KeyOptions<'a> {
+    /// `(batch, num_vl_tokens)`, true = attended.
+    pub key_mask: Option<Array<'a, bool>>,
+    /// `(batch, num_vl_tokens)`, added to the logits.
+    pub key_bias: Option<Array<'a>>,
+}
+
+impl<'a> KeyOptions<'a> {
+    /// With this mask.
+    #[must_use]
+    pub fn with_key_mask(self, key_mask: impl Into<Option<Array<'a, bool>>>) -> Self {
+        Self {
+            key_mask: key_mask.into(),
+            ..self
+        }
+    }
+
+    /// With this bias.
+    #[must_use]
+    pub fn with_key_bias(self, key_bias: impl Into<Option<Array<'a>>>) -> Self {
+        Self {
+            key_bias: key_bias.into(),
+            ..self
+        }
+    }
+}
+
+impl CrossAttention {
+    /// From `to_q.weight (width, width)`, `to_k.weight` and `to_v.weight (width, context_dim)`, `to_out.0.weight (width, width)` and their
+    /// biases.
+    ///
+    /// # Errors
+    /// [`Error::Checkpoint`] that lists every tensor that is missing, unknown or misshaped; [`Error::Input`] if `num_heads` does not divide
+    /// the width.
+    pub fn new(
+        tensors: &TensorViews<'_>,
+        num_heads: usize,
+        precision: Precision,
+        num_threads: Option<usize>,
+    ) -> Result<Self> {
+        let engine = Engine::new(precision, num_threads)?;
+        let axes = |name: &str| memory::shape_of(tensors, name);
+        // The sizes come from two of the tensors; the others must agree with them.
+        let width = axes("to_q.weight")
+            .and_then(|shape| shape.first().copied())
+            .unwrap_or(1);
+        let context_dim = axes("to_k.weight")
+            .and_then(|shape| shape.get(1).copied())
+            .unwrap_or(1);
+        let planner = Planner::default();
+        attention(&planner, engine, width, context_dim, 1)?;
+        let problems = memory::problems(tensors, &planner.into_plan().specs, |_, _| false);
+        if !problems.is_empty() {
+            let listed = spec::list(&problems, "the widths of to_q and to_k");
+            return Err(Error::Checkpoint(format!("tensors: {listed}")));
+        }
+        if width == 0 || context_dim == 0 {
+            return Err(Error::Checkpoint(format!(
+                "tensors: expected at least one input and output feature, got width {width} and context_dim {context_dim}"
+            )));
+        }
+        if num_heads == 0 || !width.is_multiple_of(num_heads) {
+            return Err(Error::Input(format!(
+                "num_heads: expected a divisor of the width {width}, got {num_heads}"
+            )));
+        }
+        let source = MemorySource::new(tensors);
+        let (attention, nbytes) = attention(&source, engine, width, context_dim, num_heads)?;
+        Ok(Self {
+            attention,
+            nbytes,
+            engine,
+            num_heads,
+            context_dim,
+            buffers: Mutex::new(Vec::new()),
+        })
+    }
+
+    /// Width of queries and output.
+    #[must_use]
+    pub fn width(&self) -> usize {
+        self.attention.width()
+    }
+
+    /// Width of the tokens attended to.
+    #[must_use]
+    pub fn context_dim(&self) -> usize {
+        self.context_dim
+    }
+
+    /// What it computes in.
+    #[must_use]
+    pub fn precision(&self) -> Precision {
+        self.engine.precision
+    }
+
+    /// Bytes of weights in memory.
+    #[must_use]
+    pub fn nbytes(&self) -> usize {
+        self.nbytes
+    }
+
+    /// Attention heads.
+    #[must_use]
+    pub fn num_heads(&self) -> usize {
+        self.num_heads
+    }
+
+    /// Keys and values of `encoder_hidden_states (batch, num_vl_tokens, context_dim)`.
+    ///
+    /// # Errors
+    /// [`Error::Shape`] and [`Error::Input`] for states that do not fit.
+    pub fn project(&self, encoder_hidden_states: Array<'_>) -> Result<KeyValues> {
+        let (batch, num_vl_tokens) =
+            self.check_rows("encoder_hidden_states", encoder_hidden_states, self.context_dim)?;
+        let packed = self.attention.project(
+            self.engine,
+            encoder_hidden_states.data(),
+            &filled("keys and values", batch, num_vl_tokens)?,
+            &mut Activations::new(),
+            &mut LinearScratch::new(),
+        )?;
+        Ok(KeyValues {
+            batch,
+            num_vl_tokens,
+            num_heads: self.num_heads,
+            width: self.width(),
+            packed,
+        })
+    }
+
+    /// Attends from `hidden_states (batch, queries, width)` to `kv`.
+    ///
+    /// `key_mask (batch, num_vl_tokens)`: true = attended; `key_bias (batch, num_vl_tokens)` is added to the logits. A query with no key left
+    /// gets zeros before the output projection. `out` is `(batch, queries, width)`; `weights`, if wanted, `(batch, heads, queries, keys)`.
+    ///
+    /// # Errors
+    /// [`Error::Shape`] and [`Error::Input`] for arguments that do not fit, [`Error::Input`] also for a result that is not finite, after which
+    /// `out` is zero; [`Error::Memory`].
+    pub fn attend(
+        &self,
+        hidden_states: Array<'_>,
+        kv: &KeyValues,
+        keys: KeyOptions<'_>,
+        weights: Option<ArrayMut<'_>>,
+        out: ArrayMut<'_>,
+    ) -> Result<()> {
+        let (batch, queries) = self.check_rows("hidden_states", hidden_states, self.width())?;
+        self.check_keys(kv, batch)?;
+        let shape = [batch, queries, self.width()];
+        let out = out.check_shape("out", "(batch, queries, width)", &shape)?;
+        let weights = match weights {
+            None => None,
+            Some(weights) => {
+                let shape = [batch, self.num_heads, queries, kv.num_vl_tokens];
+                Some(weights.check_shape("weights", "(batch, heads, queries, keys)", &shape)?)
+            }
+        };
+        let logit_bias = logit_bias([kv.batch, kv.num_vl_tokens], keys.key_mask, keys.key_bias)?;
+        let keys = CrossKeys {
+            packed: &kv.packed,
+            samples: 1,
+            subset: None,
+            bias: Bias {
+                keys: logit_bias.as_deref(),
+                shared: None,
+            },
+        };
+        let (y, engine) = (hidden_states.data(), self.engine);
+        self.with_buffers(|buffers| {
+            self.attention.mix_cross(engine, y, keys, weights, buffers)?;
+            self.attention.out(engine, Epilogue::Store, buffers, out)
+        })?;
+        let result = Array::new(out, &shape)?.check_result("hidden_states");
+        result.map(drop).inspect_err(|_| out.fill(0.0))
+    }
+
+    /// Runs `call` with buffers; never waits for the lock of their list.
+    fn with_buffers(&self, call: impl FnOnce(&mut AttentionBuffers) -> Result<()>) -> Result<()> {
+        let kept = self.buffers.try_lock().ok().and_then(|mut kept| kept.pop());
+        let mut buffers = kept.unwrap_or_else(AttentionBuffers::new);
+        let result = call(&mut buffers);
+        // Those that grew until memory ran out are not kept.
+        if !matches!(result, Err(Error::Memory { .. }))
+            && let Ok(mut kept) = self.buffers.try_lock()
+        {
+            kept.push(buffers);
+        }
+        result
+    }
+
+    fn check_keys(&self, kv: &KeyValues, batch: usize) -> Result<()> {
+        if (kv.num_heads, kv.width) != (self.num_heads, self.width()) {
+            return Err(Error::Input(format!(
+                "kv: expected keys and values of {} heads and width {}, got {} and {}",
+                self.num_heads,
+                self.width(),
+                kv.num_heads,
+                kv.width
+            )));
+        }
+        if batch != kv.batch {
+            return Err(Error::Shape(format!(
+                "hidden_states: expected the batch of kv, {}, got {batch}",
+                kv.batch
+            )));
+        }
+        Ok(())
+    }
+
+    fn check_rows(&self, name: &str, array: Array<'_>, width: usize) -> Result<(usize, usize)> {
+        match *array.shape() {
+            [batch, rows, last] if last == width && batch > 0 && rows > 0 => {
+                array.check_finite(name)?;
+                Ok((batch, rows))
+            }
+            _ => Err(Error::Shape(format!(
+                "{name}: expected (batch, rows, {width}) with at least one row, got {}",
+                show_shape(array.shape())
+            ))),
+        }
+    }
+}
+
+/// The layer from the tensors of `source`, and the bytes that it holds.
+fn attention(
+    source: &dyn Source,
+    engine: Engine,
+    width: usize,
+    context_dim: usize,
+    num_heads: usize,
+) -> Result<(Attention, usize)> {
+    let builder = Builder::new(source, engine);
+    let weights = builder.weights();
+    let layer = Attention::new(&weights, width, context_dim, num_heads, Part::ContextToKv)?;
+    Ok((layer, builder.nbytes()))
+}
+
+/// Mask and bias in one: minus infinity takes a key away.
+fn logit_bias(
+    shape: [usize; 2],
+    key_mask: Option<Array<'_, bool>>,
+    key_bias: Option<Array<'_>>,
+) -> Result<Option<Vec<f32>>> {
+    let axes = "(batch, num_vl_tokens)";
+    let mut values = match key_bias {
+        None if key_mask.is_none() => return Ok(None),
+        None => filled("key_mask", product("key_mask", &shape)?, 0.0)?,
+        Some(bias) => {
+            bias.check_shape("key_bias", axes, &shape)?;
+            if let Some(bad) = bias
+                .data()
+                .iter()
+                .find(|value| value.is_nan() || **value == f32::INFINITY)
+            {
+                return Err(Error::Input(format!(
+                    "key_bias: expected finite values or minus infinity, got {bad}"
+                )));
+            }
+            collected("key_bias", bias.data().len(), bias.data().iter().copied())?
+        }
+    };
+    if let Some(mask) = key_mask {
+        mask.check_shape("key_mask", axes, &shape)?;
+        for (value, &attended) in values.iter_mut().zip(mask.data()) {
+            if !attended {
+                *value = f32::NEG_INFINITY;
+            }
+        }
+    }
+    Ok(Some(values))
+}

@@ -1,0 +1,287 @@
+//! What interventions mean at one step, in one block: biases of logits, and rows that are replaced.
+
+use std::collections::BTreeMap;
+use std::collections::btree_map::Entry;
+
+use saccade_vla_kernels::LogitBias;
+
+use super::check::{check, check_not_empty, is_read};
+use super::extent::Extent;
+use super::groups::{Group, Groups, check_indices};
+use super::intervention::{Intervention, Patch};
+use crate::alloc::{filled, product, reserve};
+use crate::error::{Error, Result, show_shape};
+
+/// All interventions of one call, in the form in which blocks use them.
+pub(crate) struct Changes<'a> {
+    pub extent: Extent<'a>,
+    /// Those of one kind of block in which the same interventions act.
+    pub(super) biases: Vec<DenseBias>,
+    /// Which of the biases acts, by step and block; empty if none ever does.
+    acting: Vec<Option<usize>>,
+    patches: Vec<PatchedRows<'a>>,
+}
+
+/// What is added to the logits of one kind of block, `(heads, rows, keys)`; a single head if it is the same for all of them.
+pub(super) struct DenseBias {
+    values: Vec<f32>,
+    heads: usize,
+    rows: usize,
+    keys: usize,
+}
+
+struct PatchedRows<'a> {
+    step: usize,
+    block: usize,
+    /// Positions among all rows.
+    rows: Vec<usize>,
+    values: &'a [f32],
+    /// Elements from one batch element's values to the next one's; 0 if all have the same.
+    element_stride: usize,
+}
+
+/// Bytes of biases that one call may hold: some two hundred, each different for every head, at N1.5's size with three cameras.
+const MAX_BIAS_BYTES: u128 = 1 << 30;
+
+impl<'a> Changes<'a> {
+    /// Checks the interventions and works out where each acts. With none of them nothing is allocated.
+    ///
+    /// # Errors
+    /// [`Error::Shape`] and [`Error::Input`] for what does not fit the call.
+    pub(crate) fn new(interventions: &'a [Intervention], extent: Extent<'a>) -> Result<Self> {
+        let mut changes = Self {
+            extent,
+            biases: Vec::new(),
+            acting: Vec::new(),
+            patches: Vec::new(),
+        };
+        for intervention in interventions {
+            check(intervention, &extent)?;
+            for patch in &intervention.patch {
+                changes.patches.push(PatchedRows::new(patch, &extent)?);
+            }
+        }
+        let adds = |one: &Intervention| !one.cut.is_empty() || !one.key_bias.is_empty();
+        if extent.future_key_bias.is_some() || interventions.iter().any(adds) {
+            changes.find_biases(interventions)?;
+        }
+        Ok(changes)
+    }
+
+    /// That no row is patched at a step at which it does not run: at evaluations of the velocity that `refresh` does not divide only
+    /// action rows do. A step has `in_step` evaluations.
+    ///
+    /// # Errors
+    /// [`Error::Input`] for such a patch.
+    pub(crate) fn check_refresh(&self, refresh: usize, in_step: usize) -> Result<()> {
+        let actions = self.extent.groups.range(Group::Action).start;
+        let stays = |patch: &&PatchedRows<'_>| {
+            let mut evaluations = patch.step * in_step..(patch.step + 1) * in_step;
+            patch.rows.iter().any(|row| *row < actions)
+                && evaluations.any(|evaluation| !evaluation.is_multiple_of(refresh))
+        };
+        match self.patches.iter().find(stays) {
+            None => Ok(()),
+            Some(PatchedRows { step, block, .. }) => Err(Error::Input(format!(
+                "patch[({step}, {block})]: expected action tokens, since with future_refresh {refresh} the rows of state and future tokens \
+                 do not always run at step {step}"
+            ))),
+        }
+    }
+
+    /// Blocks of one kind in which the same interventions act share a bias.
+    fn find_biases(&mut self, interventions: &[Intervention]) -> Result<()> {
+        let mut known: BTreeMap<(bool, Vec<usize>), usize> = BTreeMap::new();
+        let config = self.extent.config;
+        let count = product("intervention", &[self.extent.num_steps, config.num_layers])?;
+        reserve("intervention", &mut self.acting, count)?;
+        for step in 0..self.extent.num_steps {
+            for block in 0..config.num_layers {
+                let is_cross = config.is_cross(block);
+                let acting: Vec<usize> = (0..interventions.len())
+                    .filter(|&index| acts(&interventions[index], step, block, is_cross))
+                    .collect();
+                let has_own = !is_cross && self.extent.future_key_bias.is_some();
+                let index = if acting.is_empty() && !has_own {
+                    None
+                } else {
+                    Some(match known.entry((is_cross, acting)) {
+                        Entry::Occupied(entry) => *entry.get(),
+                        Entry::Vacant(entry) => {
+                            let acting = entry.key().1.iter().map(|&index| &interventions[index]);
+                            let bias = self.sum(&acting.collect::<Vec<_>>(), is_cross)?;
+                            self.biases.push(bias);
+                            *entry.insert(self.biases.len() - 1)
+                        }
+                    })
+                };
+                self.acting.push(index);
+            }
+        }
+        Ok(())
+    }
+
+    /// The sum of what `acting` add in blocks of one kind, and of what these have of their own.
+    fn sum(&self, acting: &[&Intervention], is_cross: bool) -> Result<DenseBias> {
+        let Extent { groups, config, .. } = self.extent;
+        let rows = groups.num_rows();
+        let keys = if is_cross { groups.vl } else { rows };
+        let everywhere = acting.iter().all(|one| one.heads.is_none());
+        let heads = if everywhere { 1 } else { config.num_heads };
+        let held: usize = self.biases.iter().map(|bias| bias.values.len()).sum();
+        let bytes = 4 * (held as u128 + heads as u128 * rows as u128 * keys as u128);
+        if bytes > MAX_BIAS_BYTES {
+            return Err(Error::Input(format!(
+                "intervention: cuts and biases over {heads} heads, {rows} rows and {keys} keys need {bytes} bytes, expected at most \
+                 {MAX_BIAS_BYTES}; give fewer of them heads, blocks or steps of their own"
+            )));
+        }
+        let mut bias = DenseBias {
+            values: filled("intervention", heads * rows * keys, 0.0)?,
+            heads,
+            rows,
+            keys,
+        };
+        if let Some(own) = self.extent.future_key_bias.filter(|_| !is_cross) {
+            for row in bias.values.chunks_exact_mut(keys) {
+                row[groups.range(Group::Future)].copy_from_slice(own);
+            }
+        }
+        for intervention in acting {
+            bias.add(intervention, &groups, is_cross);
+        }
+        // Each is below infinity; a sum of several may still reach it.
+        if bias
+            .values
+            .iter()
+            .any(|value| value.is_nan() || *value == f32::INFINITY)
+        {
+            return Err(Error::Input(
+                "key_bias: expected biases whose sum for a key is below infinity".to_owned(),
+            ));
+        }
+        Ok(bias)
+    }
+
+    /// What is added to the logits of `block` at `step`, for the rows from `first_row` on.
+    pub(crate) fn bias(&self, step: usize, block: usize, first_row: usize) -> Option<LogitBias<'_>> {
+        let acting = self.acting.get(step * self.extent.config.num_layers + block)?;
+        let bias = &self.biases[(*acting)?];
+        Some(LogitBias {
+            values: &bias.values[first_row * bias.keys..],
+            head_stride: if bias.heads == 1 { 0 } else { bias.rows * bias.keys },
+            query_stride: bias.keys,
+        })
+    }
+
+    /// Replaces rows after `block` at `step`. `x` holds the rows from `first_row` on of `samples` sequences for each batch element.
+    pub(crate) fn patch(&self, step: usize, block: usize, first_row: usize, samples: usize, x: &mut [f32]) {
+        let Extent { groups, config, .. } = self.extent;
+        let width = config.width;
+        let sequence_len = (groups.num_rows() - first_row) * width;
+        let patches = self.patches.iter();
+        for patch in patches.filter(|patch| (patch.step, patch.block) == (step, block)) {
+            for (index, sequence) in x.chunks_exact_mut(sequence_len).enumerate() {
+                let values = &patch.values[index / samples * patch.element_stride..];
+                for (row, value) in patch.rows.iter().zip(values.chunks_exact(width)) {
+                    if let Some(row) = row.checked_sub(first_row) {
+                        sequence[row * width..(row + 1) * width].copy_from_slice(value);
+                    }
+                }
+            }
+        }
+    }
+}
+
+/// Whether an intervention adds to the logits of this block.
+fn acts(intervention: &Intervention, step: usize, block: usize, is_cross: bool) -> bool {
+    let limited_to =
+        |chosen: &Option<Vec<usize>>, index| chosen.as_ref().is_none_or(|chosen| chosen.contains(&index));
+    let sources = intervention.cut.iter().map(|(_, source)| source);
+    let mut keys = sources.chain(intervention.key_bias.iter().map(|(tokens, _)| tokens));
+    limited_to(&intervention.steps, step)
+        && limited_to(&intervention.blocks, block)
+        && keys.any(|tokens| is_read(tokens, is_cross))
+}
+
+impl DenseBias {
+    /// Adds the cuts and biases of an intervention.
+    fn add(&mut self, intervention: &Intervention, groups: &Groups, is_cross: bool) {
+        let is_chosen = |head: &usize| {
+            intervention
+                .heads
+                .as_ref()
+                .is_none_or(|heads| heads.contains(head))
+        };
+        let heads: Vec<usize> = (0..self.heads).filter(is_chosen).collect();
+        let everyone: Vec<usize> = (0..self.rows).collect();
+        let mut add = |readers: &[usize], keys: &[usize], values: &dyn Fn(usize) -> f32| {
+            for &head in &heads {
+                for &reader in readers {
+                    let row = &mut self.values[(head * self.rows + reader) * self.keys..][..self.keys];
+                    for (index, &key) in keys.iter().enumerate() {
+                        row[key] += values(index);
+                    }
+                }
+            }
+        };
+        for (reader, source) in &intervention.cut {
+            if is_read(source, is_cross) {
+                add(&groups.positions(reader), &groups.positions(source), &|_| {
+                    f32::NEG_INFINITY
+                });
+            }
+        }
+        for (tokens, bias) in &intervention.key_bias {
+            if is_read(tokens, is_cross) {
+                add(
+                    &everyone,
+                    &groups.positions(tokens),
+                    &|index| match bias.shape() {
+                        [] => bias.data()[0],
+                        _ => bias.data()[index],
+                    },
+                );
+            }
+        }
+    }
+}
+
+impl<'a> PatchedRows<'a> {
+    /// # Errors
+    /// [`Error::Shape`] and [`Error::Input`] for a patch that does not fit the call.
+    fn new(patch: &'a Patch, extent: &Extent<'_>) -> Result<Self> {
+        let Extent { config, groups, .. } = extent;
+        let width = config.width;
+        check_indices("patch: step", &[patch.step], extent.num_steps)?;
+        check_indices("patch: block", &[patch.block], config.num_layers)?;
+        if patch.tokens.group == Group::Vl {
+            return Err(Error::Input(
+                "patch: blocks change rows, not vl; expected state, future or action".to_owned(),
+            ));
+        }
+        let name = format!("patch[({}, {})]", patch.step, patch.block);
+        let count = groups.check(&name, &patch.tokens)?;
+        check_not_empty(&name, &patch.tokens, count)?;
+        let element_stride = match patch.rows.shape() {
+            shape if shape == [count, width] => 0,
+            shape if shape == [extent.batch, count, width] => count * width,
+            shape => {
+                return Err(Error::Shape(format!(
+                    "{name}: expected (tokens, width) = {} or (batch, tokens, width) = {} for {}, got {}",
+                    show_shape(&[count, width]),
+                    show_shape(&[extent.batch, count, width]),
+                    patch.tokens.group.name(),
+                    show_shape(shape)
+                )));
+            }
+        };
+        Ok(Self {
+            step: patch.step,
+            block: patch.block,
+            rows: groups.positions(&patch.tokens),
+            values: patch.rows.view().check_finite(&name)?.data(),
+            element_stride,
+        })
+    }
+}

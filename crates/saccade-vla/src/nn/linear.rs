@@ -1,0 +1,104 @@
+//! Linear layers: `x W^T + b`, one or several of the same input packed as one.
+
+use saccade_vla_kernels::{Epilogue, LinearScratch, PackedLinear};
+
+use super::weights::Weights;
+use crate::engine::Engine;
+use crate::error::Result;
+use crate::ops;
+use crate::precision::Role;
+use crate::profile::Part;
+
+/// A linear layer: `weight (out_features, in_features)` and, if it has one, `bias (out_features)`.
+pub(crate) struct Linear {
+    packed: PackedLinear,
+    /// The part that its work is counted under; `None` does not count it.
+    part: Option<Part>,
+}
+
+impl Linear {
+    /// The layer whose tensors are `weights`, with a bias.
+    pub(crate) fn new(
+        weights: &Weights<'_>,
+        in_features: usize,
+        out_features: usize,
+        role: Role,
+    ) -> Result<Self> {
+        Self::stacked(&[(weights.clone(), out_features)], in_features, role, true)
+    }
+
+    /// Layers of the same input, each with its `out_features`, as one: their outputs are concatenated.
+    pub(crate) fn stacked(
+        parts: &[(Weights<'_>, usize)],
+        in_features: usize,
+        role: Role,
+        has_bias: bool,
+    ) -> Result<Self> {
+        let parts: Vec<_> = parts
+            .iter()
+            .map(|(weights, out_features)| (weights, vec![*out_features, in_features]))
+            .collect();
+        Self::of_shapes(&parts, role, has_bias)
+    }
+
+    /// A convolution whose windows do not overlap, `weight (out_features, ...)` and a bias: each window is a row.
+    pub(crate) fn windows(weights: &Weights<'_>, shape: &[usize], role: Role) -> Result<Self> {
+        Self::of_shapes(&[(weights, shape.to_vec())], role, true)
+    }
+
+    fn of_shapes(parts: &[(&Weights<'_>, Vec<usize>)], role: Role, has_bias: bool) -> Result<Self> {
+        let (builder, shape) = &parts[0];
+        let in_features = shape[1..].iter().product();
+        let mut tensors = Vec::with_capacity(parts.len());
+        for (weights, shape) in parts {
+            let weight = weights.weight(role, shape)?;
+            let bias = has_bias.then(|| weights.bias("bias", shape[0])).transpose()?;
+            tensors.push((weight, shape[0], bias));
+        }
+        let views: Vec<_> = tensors
+            .iter()
+            .map(|(weight, out_features, bias)| (weight.weight(*out_features, in_features), bias.as_deref()))
+            .collect();
+        let packed = builder.pack(role, &views)?;
+        drop(views);
+        if role.is_given_back() {
+            for (weight, ..) in tensors {
+                builder.give_back(weight);
+            }
+        }
+        Ok(Self { packed, part: None })
+    }
+
+    /// A layer that is packed already.
+    pub(crate) fn packed(packed: PackedLinear) -> Self {
+        Self { packed, part: None }
+    }
+
+    /// The layer, its work counted under `part`.
+    pub(crate) fn counted(self, part: Part) -> Self {
+        Self {
+            part: Some(part),
+            ..self
+        }
+    }
+
+    pub(crate) fn in_features(&self) -> usize {
+        self.packed.in_features()
+    }
+
+    pub(crate) fn out_features(&self) -> usize {
+        self.packed.out_features()
+    }
+
+    /// `out = epilogue(x W^T + b)` for rows `x (rows, in_features)` and `out (rows, out_features)`.
+    pub(crate) fn apply(
+        &self,
+        engine: Engine,
+        x: &[f32],
+        epilogue: Epilogue,
+        out: &mut [f32],
+        scratch: &mut LinearScratch,
+    ) -> Result<()> {
+        ops::linear(self.part, &self.packed, engine.threads, x, epilogue, out, scratch)
+    }
+}

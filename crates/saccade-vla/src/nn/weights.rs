@@ -1,0 +1,418 @@
+//! What layers are built from. A model is described once, by the code that builds its layers from [`Weights`]; what comes of that depends on
+//! the [`Source`]: the list of its tensors (planner), its size in memory (sizer), or its layers (a file, or tensors in memory).
+
+use std::cell::Cell;
+use std::ops::Range;
+
+use half::bf16;
+use saccade_vla_checkpoint::{Elements, TensorSpec};
+use saccade_vla_kernels::{Matrix, PackedLinear, WeightRef, quantize_rows};
+
+use crate::alloc::{collected, filled, product};
+use crate::array::{first_not_finite, unravel};
+use crate::engine::Engine;
+use crate::error::{Error, Result, show_shape};
+use crate::ops::{check_interrupted, packing_error};
+use crate::precision::Role;
+
+/// A tensor that a layer asks for.
+pub(crate) struct Request {
+    pub spec: TensorSpec,
+    /// Slices of the first axis; none asks for the whole tensor.
+    pub slices: Option<Range<usize>>,
+    /// Whether its memory comes back to be read into again: only what is not kept may be read into larger memory than it needs.
+    pub is_given_back: bool,
+}
+
+/// One of the back ends that a model's description is run against.
+pub(crate) trait Source {
+    /// The tensor, or its outline where nothing but names and sizes is wanted. One without elements need not be there.
+    ///
+    /// # Errors
+    /// As the source has them: a tensor that is missing or cannot be read.
+    fn tensor(&self, request: &Request) -> Result<Tensor>;
+
+    /// Takes back a tensor that is not needed any more.
+    fn give_back(&self, _used: Elements) {}
+
+    /// Bytes of a layer packed from outlines.
+    ///
+    /// # Errors
+    /// As packing has them.
+    fn packed_nbytes(&self, _role: Role, _outline: Outline) -> Result<usize> {
+        Ok(0)
+    }
+}
+
+/// The elements of a tensor, or what is known without them.
+pub(crate) enum Tensor {
+    Held(Elements),
+    Outline(Stored),
+}
+
+/// What a weight is packed from.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub(crate) enum Stored {
+    F32,
+    Bf16,
+}
+
+/// A weight without its elements.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Outline {
+    pub stored: Stored,
+    pub out_features: usize,
+    pub in_features: usize,
+}
+
+/// A weight to pack, `(out_features, in_features)`.
+#[derive(Clone, Copy)]
+pub(crate) enum Weight<'a> {
+    Held(WeightRef<'a>),
+    Outline(Outline),
+}
+
+impl Tensor {
+    /// The elements as float32; none of an outline.
+    pub(crate) fn into_f32(self) -> Result<Vec<f32>> {
+        Ok(match self {
+            Self::Held(elements) => elements.into_f32()?,
+            Self::Outline(_) => Vec::new(),
+        })
+    }
+
+    /// As `(out_features, in_features)`, which is how it is stored.
+    pub(crate) fn weight(&self, out_features: usize, in_features: usize) -> Weight<'_> {
+        match self {
+            Self::Held(elements) => Weight::Held(weight_view(elements, out_features, in_features)),
+            Self::Outline(stored) => Weight::Outline(Outline {
+                stored: *stored,
+                out_features,
+                in_features,
+            }),
+        }
+    }
+
+    /// As `(out_features, in_features)` of a tensor stored as `(in_features, out_features)`, as the category-specific layers are.
+    pub(crate) fn transposed(&self, out_features: usize, in_features: usize) -> Weight<'_> {
+        let Self::Held(elements) = self else {
+            return self.weight(out_features, in_features);
+        };
+        Weight::Held(match weight_view(elements, in_features, out_features) {
+            WeightRef::F32(view) => WeightRef::F32(view.transpose()),
+            WeightRef::Bf16(view) => WeightRef::Bf16(view.transpose()),
+            WeightRef::Int8 { .. } => {
+                unreachable!("category-specific weights are checked to be floating point")
+            }
+        })
+    }
+
+    /// The tensor rounded to bf16 where a layer of this role computes in float32 but is to be held in bf16.
+    pub(crate) fn held_as(self, engine: Engine, role: Role) -> Result<Self> {
+        match role {
+            Role::Time => self.rounded(engine),
+            _ => Ok(self),
+        }
+    }
+
+    /// The tensor rounded to bf16 unless it is to be held as it is stored.
+    fn rounded(self, engine: Engine) -> Result<Self> {
+        let is_rounded = engine.precision.rounds_weights();
+        Ok(match self {
+            Self::Held(Elements::F32(values)) if is_rounded => {
+                let rounded = values.iter().copied().map(bf16::from_f32);
+                Self::Held(Elements::Bf16(collected("weights", values.len(), rounded)?))
+            }
+            Self::Outline(Stored::F32) if is_rounded => Self::Outline(Stored::Bf16),
+            as_it_is => as_it_is,
+        })
+    }
+}
+
+impl Weight<'_> {
+    /// The inputs `first .. first + count`.
+    pub(crate) fn inputs(self, first: usize, count: usize) -> Self {
+        match self {
+            Self::Held(WeightRef::F32(view)) => {
+                Self::Held(WeightRef::F32(view.columns(first..first + count)))
+            }
+            Self::Held(WeightRef::Bf16(view)) => {
+                Self::Held(WeightRef::Bf16(view.columns(first..first + count)))
+            }
+            Self::Held(WeightRef::Int8 { values, scales }) => Self::Held(WeightRef::Int8 {
+                values: values.columns(first..first + count),
+                scales,
+            }),
+            Self::Outline(outline) => Self::Outline(Outline {
+                in_features: count,
+                ..outline
+            }),
+        }
+    }
+
+    fn in_features(&self) -> usize {
+        match self {
+            Self::Held(WeightRef::F32(view)) => view.num_columns(),
+            Self::Held(WeightRef::Bf16(view)) => view.num_columns(),
+            Self::Held(WeightRef::Int8 { values, .. }) => values.num_columns(),
+            Self::Outline(outline) => outline.in_features,
+        }
+    }
+}
+
+/// `(out_features, in_features)` as they are stored.
+pub(crate) fn weight_view(elements: &Elements, out_features: usize, in_features: usize) -> WeightRef<'_> {
+    let weight = match elements {
+        Elements::F32(data) => WeightRef::F32(Matrix::new(data, in_features)),
+        Elements::Bf16(data) => WeightRef::Bf16(Matrix::new(data, in_features)),
+        Elements::Int8 { values, scales } => WeightRef::Int8 {
+            values: Matrix::new(values, in_features),
+            scales,
+        },
+    };
+    debug_assert_eq!(weight.shape(), (out_features, in_features));
+    weight
+}
+
+/// What all layers of one model are built with.
+pub(crate) struct Builder<'a> {
+    source: &'a dyn Source,
+    engine: Engine,
+    nbytes: Cell<usize>,
+}
+
+impl<'a> Builder<'a> {
+    pub(crate) fn new(source: &'a dyn Source, engine: Engine) -> Self {
+        Self {
+            source,
+            engine,
+            nbytes: Cell::new(0),
+        }
+    }
+
+    /// The weights of the whole model.
+    pub(crate) fn weights(&self) -> Weights<'_> {
+        Weights {
+            builder: self,
+            path: String::new(),
+        }
+    }
+
+    /// Bytes of all that was built.
+    pub(crate) fn nbytes(&self) -> usize {
+        self.nbytes.get()
+    }
+}
+
+/// The weights below one name.
+#[derive(Clone)]
+pub(crate) struct Weights<'a> {
+    builder: &'a Builder<'a>,
+    path: String,
+}
+
+impl Weights<'_> {
+    /// The weights below `name`.
+    pub(crate) fn at(&self, name: impl std::fmt::Display) -> Self {
+        Self {
+            builder: self.builder,
+            path: self.name(name),
+        }
+    }
+
+    fn name(&self, name: impl std::fmt::Display) -> String {
+        match self.path.as_str() {
+            "" => name.to_string(),
+            path => format!("{path}.{name}"),
+        }
+    }
+
+    pub(crate) fn engine(&self) -> Engine {
+        self.builder.engine
+    }
+
+    /// The weight of a layer of this role, `(out_features, in_features)` or with several axes in place of the last one.
+    pub(crate) fn weight(&self, role: Role, shape: &[usize]) -> Result<Tensor> {
+        let weight = self.read(Request {
+            spec: TensorSpec {
+                may_be_int8: role.is_given_back(),
+                ..TensorSpec::plain(&self.name("weight"), shape)
+            },
+            slices: None,
+            is_given_back: role.is_given_back(),
+        })?;
+        weight.held_as(self.engine(), role)
+    }
+
+    /// The vector `name`, which will be part of a packed layer. Empty if the source gives an outline.
+    pub(crate) fn bias(&self, name: &str, len: usize) -> Result<Vec<f32>> {
+        let bias = self.read(Request {
+            spec: TensorSpec::plain(&self.name(name), &[len]),
+            slices: None,
+            is_given_back: false,
+        })?;
+        bias.into_f32()
+    }
+
+    /// The vector `name`, kept as float32. Empty if the source gives an outline.
+    pub(crate) fn vector(&self, name: &str, len: usize) -> Result<Vec<f32>> {
+        self.count(4 * len);
+        self.bias(name, len)
+    }
+
+    /// The first `count` rows of the table `weight`, kept as float32. Empty if the source gives an outline.
+    pub(crate) fn table(&self, shape: [usize; 2], count: usize) -> Result<Vec<f32>> {
+        self.count(4 * count * shape[1]);
+        let table = self.read(Request {
+            spec: TensorSpec::plain(&self.name("weight"), &shape),
+            slices: (count != shape[0]).then_some(0..count),
+            is_given_back: false,
+        })?;
+        table.into_f32()
+    }
+
+    /// The table `weight`, whose rows are looked up: as int8 with a scale for each row if that is what is computed in, in bf16 if that is
+    /// how it is stored or what is computed in, else in float32.
+    pub(crate) fn looked_up(&self, shape: [usize; 2]) -> Result<Tensor> {
+        let table = self.read(Request {
+            spec: TensorSpec::plain(&self.name("weight"), &shape),
+            slices: None,
+            is_given_back: false,
+        })?;
+        let [rows, width] = shape;
+        let is_int8 = self.engine().precision.quantizes_tables();
+        let table = match table {
+            Tensor::Held(elements) if is_int8 => quantized(&elements, shape)?,
+            table => table.rounded(self.engine())?,
+        };
+        self.count(match &table {
+            _ if is_int8 => rows * (size_of::<i8>() * width + size_of::<f32>()),
+            Tensor::Held(Elements::Bf16(_)) | Tensor::Outline(Stored::Bf16) => {
+                size_of::<bf16>() * rows * width
+            }
+            _ => size_of::<f32>() * rows * width,
+        });
+        Ok(table)
+    }
+
+    /// Slice `id` of tensor `name`, whose first axis is of embodiments.
+    pub(crate) fn slice(&self, name: &str, shape: &[usize], id: usize) -> Result<Tensor> {
+        self.read(Request {
+            spec: TensorSpec {
+                per_embodiment: true,
+                ..TensorSpec::plain(&self.name(name), shape)
+            },
+            slices: Some(id..id + 1),
+            is_given_back: false,
+        })
+    }
+
+    /// Packs weights with their biases as one layer: their outputs are concatenated. Biases of outlines are not looked at.
+    pub(crate) fn pack(&self, role: Role, parts: &[(Weight<'_>, Option<&[f32]>)]) -> Result<PackedLinear> {
+        let engine = self.engine();
+        let arithmetic = engine.precision.arithmetic(role);
+        let in_features = parts[0].0.in_features();
+        let mut held = Vec::with_capacity(parts.len());
+        let mut outline: Option<Outline> = None;
+        for (weight, bias) in parts {
+            match *weight {
+                Weight::Held(weight) => held.push((weight, *bias)),
+                Weight::Outline(part) => {
+                    outline = Some(outline.map_or(part, |all| Outline {
+                        stored: all.stored.min(part.stored),
+                        out_features: all.out_features + part.out_features,
+                        ..all
+                    }));
+                }
+            }
+        }
+        if let Some(outline) = outline {
+            self.count(self.builder.source.packed_nbytes(role, outline)?);
+            // Stands in for the layer: the same inputs and no output.
+            held = vec![(WeightRef::F32(Matrix::new(&[], in_features)), None)];
+        }
+        let packed =
+            PackedLinear::pack(engine.isa, arithmetic, engine.threads, &held).map_err(packing_error)?;
+        let packed = match role.keeps_outliers() {
+            true => packed.keeping_outliers(),
+            false => packed,
+        };
+        if outline.is_none() {
+            self.count(packed.nbytes());
+        }
+        Ok(packed)
+    }
+
+    /// Gives the memory of a weight back, for the next one.
+    pub(crate) fn give_back(&self, used: Tensor) {
+        if let Tensor::Held(elements) = used {
+            self.builder.source.give_back(elements);
+        }
+    }
+
+    fn count(&self, bytes: usize) {
+        self.builder.nbytes.set(self.builder.nbytes.get() + bytes);
+    }
+
+    /// # Errors
+    /// [`Error::Checkpoint`] also for a tensor with an element that is not finite.
+    fn read(&self, request: Request) -> Result<Tensor> {
+        check_interrupted()?;
+        let tensor = self.builder.source.tensor(&request)?;
+        if let Tensor::Held(elements) = &tensor {
+            check_finite(&request, elements)?;
+        }
+        Ok(tensor)
+    }
+}
+
+/// The rows of a table as int8, each with its scale.
+fn quantized(table: &Elements, [num_rows, width]: [usize; 2]) -> Result<Tensor> {
+    /// Rows between two looks at whether the call is to stop.
+    const TOGETHER: usize = 4096;
+    let mut values = filled("weights", product("weights", &[num_rows, width])?, 0_i8)?;
+    let mut scales = filled("weights", num_rows, 0.0)?;
+    let view = weight_view(table, num_rows, width);
+    for first in (0..num_rows).step_by(TOGETHER) {
+        check_interrupted()?;
+        let rows = first..num_rows.min(first + TOGETHER);
+        let values = &mut values[rows.start * width..rows.end * width];
+        quantize_rows(view.rows(rows.clone()), values, &mut scales[rows]);
+    }
+    Ok(Tensor::Held(Elements::Int8 { values, scales }))
+}
+
+/// That weights are finite. One that is not spoils every action, without a sign of where it comes from.
+fn check_finite(request: &Request, elements: &Elements) -> Result<()> {
+    let (position, value) = match elements {
+        Elements::F32(values) => match first_not_finite(values) {
+            None => return Ok(()),
+            Some(position) => (position, values[position]),
+        },
+        Elements::Bf16(values) => match first_not_finite_bf16(values) {
+            None => return Ok(()),
+            Some(position) => (position, values[position].to_f32()),
+        },
+        // Scales are checked where they are read.
+        Elements::Int8 { .. } => return Ok(()),
+    };
+    let spec = &request.spec;
+    let first = request.slices.as_ref().map_or(0, |slices| slices.start);
+    let slice: usize = spec.shape[1..].iter().product();
+    Err(Error::Checkpoint(format!(
+        "{}: expected finite weights, got {value} at index {}",
+        spec.name,
+        show_shape(&unravel(first * slice + position, &spec.shape))
+    )))
+}
+
+fn first_not_finite_bf16(values: &[bf16]) -> Option<usize> {
+    const TOGETHER: usize = 4096;
+    const EXPONENT: u16 = 0x7f80;
+    let is_bad = |value: &bf16| value.to_bits() & EXPONENT == EXPONENT;
+    let chunk = values
+        .chunks(TOGETHER)
+        .position(|chunk| chunk.iter().fold(false, |bad, value| bad | is_bad(value)))?;
+    let within = values[chunk * TOGETHER..].iter().position(is_bad)?;
+    Some(chunk * TOGETHER + within)
+}

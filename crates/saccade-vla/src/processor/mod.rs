@@ -1,0 +1,322 @@
+//! From camera frames and an instruction to what a backbone takes, as the released processors prepare it.
+
+mod files;
+mod flexible;
+mod frames;
+mod options;
+mod prompt;
+mod python_text;
+mod settings;
+mod source;
+#[cfg(test)]
+mod tests;
+mod tokenizer;
+mod view;
+
+use saccade_vla_kernels::Isa;
+
+use crate::alloc::{filled, product, reserve};
+use crate::array::OwnedArray;
+use crate::config::Version;
+use crate::error::{Error, Result};
+use prompt::{SpecialIds, prompt};
+use settings::{Settings, Sizes};
+use tokenizer::check_length;
+use view::view;
+
+pub use frames::{Frame, View};
+pub use settings::{Preprocessing, ProcessorOptions};
+pub use source::ProcessorSource;
+pub use tokenizer::{Tokenizer, TokenizerFiles};
+
+/// Positions that the language model of N1.5 and N1.6 has, and that of N1.7.
+const MAX_POSITIONS: usize = 40_960;
+const N17_MAX_POSITIONS: usize = 262_144;
+
+/// What a robot sees and is told at one time.
+#[derive(Clone, Debug, Default)]
+pub struct Observation<'a> {
+    /// The frame of each camera, and the camera's name where it has one.
+    pub views: Vec<(Option<&'a str>, Frame<'a>)>,
+    /// Whether the views stand in the order of the prompt, also where the preprocessing would sort them by name.
+    pub is_ordered: bool,
+    /// What the robot is to do. Without it the released default is taken, where there is one.
+    pub instruction: Option<&'a str>,
+    /// N1.5: whether the instruction stands in the prompt as it is, even if the processor renders instructions as lists.
+    pub plain_text: bool,
+}
+
+/// Inputs of a backbone, of a batch of observations.
+#[derive(Clone, Debug)]
+pub struct Prepared {
+    /// N1.5: one array `(batch * views, 3, height, width)`. N1.6: an array `(1, 3, height, width)` for each view. N1.7: one array
+    /// `(patches, 1536)`.
+    pub pixel_values: Vec<OwnedArray>,
+    /// The tokens `(batch, length)`, padded on the left.
+    pub input_ids: Vec<i64>,
+    /// `(batch, length)`: false where `input_ids` is padding.
+    pub attention_mask: Vec<bool>,
+    /// Tokens of the longest prompt.
+    pub length: usize,
+    /// N1.7: the grid of patches of every view.
+    pub image_grid_thw: Vec<[i64; 3]>,
+    /// The names of the views in the order of the prompt, where they have names.
+    pub view_names: Option<Vec<String>>,
+}
+
+/// Prepares frames and instructions for the backbone of one version.
+///
+/// It is immutable: any number of threads may use it at the same time.
+pub struct Processor {
+    settings: Settings,
+    tokenizer: Tokenizer,
+    ids: SpecialIds,
+    isa: Isa,
+}
+
+impl Processor {
+    /// The processor of `version`: `n1.5`, `n1.6` or `n1.7`.
+    ///
+    /// # Errors
+    /// [`Error::Input`] for another version and for options that are not the version's, all listed; [`Error::Checkpoint`] for a tokenizer
+    /// without the version's special tokens; [`Error::Isa`] for an unknown instruction set in the environment.
+    pub fn new(version: &str, tokenizer: Tokenizer, options: &ProcessorOptions<'_>) -> Result<Self> {
+        let version = Version::named(version).filter(|version| *version != Version::N1);
+        let version = version
+            .ok_or_else(|| Error::Input("version: expected \"n1.5\", \"n1.6\" or \"n1.7\"".to_owned()))?;
+        let settings = Settings::new(version, options)?;
+        let ids = SpecialIds::find(&tokenizer, version)?;
+        Ok(Self {
+            settings,
+            ids,
+            tokenizer,
+            isa: Isa::from_env()?,
+        })
+    }
+
+    /// `n1.5`, `n1.6` or `n1.7`.
+    #[must_use]
+    pub fn version(&self) -> &'static str {
+        self.settings.version.name()
+    }
+
+    /// Whose frames and words it prepares.
+    #[must_use]
+    pub fn preprocessing(&self) -> Preprocessing {
+        self.settings.preprocessing
+    }
+
+    /// Height and width of the views, and their image tokens; none for N1.6 and N1.7, where they depend on the frame.
+    #[must_use]
+    pub fn view_size(&self) -> Option<(usize, usize)> {
+        match self.settings.sizes {
+            Sizes::Square { size, tokens, .. } => Some((size, tokens)),
+            Sizes::Flexible(_) => None,
+        }
+    }
+
+    /// Number of tokens of the tokenizer.
+    #[must_use]
+    pub fn num_tokens(&self) -> usize {
+        self.tokenizer.len()
+    }
+
+    /// The id that stands for a token of an image.
+    #[must_use]
+    pub fn image_token_id(&self) -> u32 {
+        self.ids.image
+    }
+
+    /// The view that a frame becomes.
+    ///
+    /// # Errors
+    /// [`Error::Shape`] and [`Error::Input`] for a frame that is none; [`Error::Memory`].
+    pub fn view(&self, frame: Frame<'_>) -> Result<View> {
+        view(&self.settings, self.isa, "image", frame)
+    }
+
+    /// The ids of plain text.
+    ///
+    /// # Errors
+    /// [`Error::Input`] for text that is too long for any model.
+    pub fn tokens(&self, text: &str) -> Result<Vec<u32>> {
+        self.tokenizer.encode(text)
+    }
+
+    /// The text of each of these tokens.
+    ///
+    /// # Errors
+    /// [`Error::Input`] for an id that is no token's.
+    pub fn texts(&self, ids: &[i64]) -> Result<Vec<String>> {
+        let text = |&id: &i64| {
+            let found = u32::try_from(id).ok().and_then(|id| self.tokenizer.text_of(id));
+            found.ok_or_else(|| {
+                Error::Input(format!(
+                    "ids: expected those of the tokenizer's {} tokens, got {id}",
+                    self.num_tokens()
+                ))
+            })
+        };
+        ids.iter().map(text).collect()
+    }
+
+    /// The inputs of a batch of observations.
+    ///
+    /// # Errors
+    /// [`Error::Shape`] and [`Error::Input`] for frames that are none, for observations with different views, and for an instruction that is too
+    /// long or that changes the number of image tokens; [`Error::Memory`].
+    pub fn process(&self, observations: &[Observation<'_>]) -> Result<Prepared> {
+        let orders = self.orders(observations)?;
+        let view_names = orders.first().and_then(|order| names(&observations[0], order));
+        let mut views = Vec::new();
+        let mut prompts = Vec::with_capacity(observations.len());
+        for (observation, order) in observations.iter().zip(&orders) {
+            let first = views.len();
+            for &index in order {
+                let (name, frame) = observation.views[index];
+                let name =
+                    name.map_or_else(|| format!("frames[{index}]"), |name| format!("frames['{name}']"));
+                views.push(view(&self.settings, self.isa, &name, frame)?);
+            }
+            let tokens: Vec<usize> = views[first..].iter().map(|view: &View| view.tokens).collect();
+            prompts.push(self.prompt_ids(observation, &tokens)?);
+        }
+        let (input_ids, attention_mask, length) = self.padded(&prompts)?;
+        Ok(Prepared {
+            image_grid_thw: views.iter().filter_map(|view| view.grid).collect(),
+            pixel_values: self.joined(views)?,
+            input_ids,
+            attention_mask,
+            length,
+            view_names,
+        })
+    }
+
+    /// The order in which the views of each observation stand.
+    fn orders(&self, observations: &[Observation<'_>]) -> Result<Vec<Vec<usize>>> {
+        let Some(first) = observations.first() else {
+            return Err(Error::Input(
+                "frames: expected at least one observation, got none".to_owned(),
+            ));
+        };
+        let mut orders: Vec<Vec<usize>> = Vec::with_capacity(observations.len());
+        for observation in observations {
+            let views = &observation.views;
+            if views.is_empty() {
+                return Err(Error::Input(
+                    "frames: expected at least one view, got none".to_owned(),
+                ));
+            }
+            let mut order: Vec<usize> = (0..views.len()).collect();
+            if self.settings.preprocessing == Preprocessing::Lerobot && !observation.is_ordered {
+                order.sort_by_key(|&index| views[index].0);
+            }
+            if let Some(expected) = orders.first() {
+                let (expected, got) = (names(first, expected), names(observation, &order));
+                if views.len() != first.views.len() || expected != got {
+                    return Err(Error::Input(format!(
+                        "frames: expected the same views in every observation, got {} and {}",
+                        show_views(first, expected),
+                        show_views(observation, got)
+                    )));
+                }
+            }
+            orders.push(order);
+        }
+        Ok(orders)
+    }
+
+    /// The ids of a prompt.
+    fn prompt_ids(&self, observation: &Observation<'_>, views: &[usize]) -> Result<Vec<u32>> {
+        let most = match self.settings.version {
+            Version::N17 => N17_MAX_POSITIONS,
+            _ => MAX_POSITIONS,
+        };
+        let expected = views
+            .iter()
+            .fold(0_usize, |sum, tokens| sum.saturating_add(*tokens));
+        if expected > most {
+            return Err(Error::Input(format!(
+                "frames: expected at most {most} image tokens, got {expected} in {} views",
+                views.len()
+            )));
+        }
+        check_length("instruction", observation.instruction.unwrap_or_default())?;
+        let text = prompt(
+            &self.settings,
+            observation.instruction,
+            observation.plain_text,
+            views,
+        )?;
+        let ids = self.tokenizer.ids("instruction", &text)?;
+        let found = ids.iter().filter(|id| **id == self.ids.image).count();
+        if found != expected {
+            return Err(Error::Input(format!(
+                "instruction: expected no token that stands for an image, got {} of them",
+                found.saturating_sub(expected)
+            )));
+        }
+        if ids.len() > most {
+            return Err(Error::Input(format!(
+                "instruction: expected a prompt of at most {most} tokens, got {} with its {expected} image tokens",
+                ids.len()
+            )));
+        }
+        Ok(ids)
+    }
+
+    /// Ids and mask, filled up on the left to the longest prompt.
+    fn padded(&self, prompts: &[Vec<u32>]) -> Result<(Vec<i64>, Vec<bool>, usize)> {
+        const WHAT: &str = "input_ids";
+        let length = prompts.iter().map(Vec::len).max().unwrap_or(0);
+        let len = product(WHAT, &[prompts.len(), length])?;
+        let mut ids = filled(WHAT, len, i64::from(self.ids.padding))?;
+        let mut mask = filled(WHAT, len, false)?;
+        for (row, prompt) in prompts.iter().enumerate() {
+            let end = (row + 1) * length;
+            let start = end - prompt.len();
+            for (to, &id) in ids[start..end].iter_mut().zip(prompt) {
+                *to = i64::from(id);
+            }
+            mask[start..end].fill(true);
+        }
+        Ok((ids, mask, length))
+    }
+
+    /// The views in the arrays that the backbone takes.
+    fn joined(&self, views: Vec<View>) -> Result<Vec<OwnedArray>> {
+        if self.settings.version == Version::N16 {
+            return Ok(views.into_iter().map(|view| view.pixels).collect());
+        }
+        let Some(first) = views.first() else {
+            return Ok(Vec::new());
+        };
+        let (rows, mut shape) = match self.settings.version {
+            Version::N15 => (views.len(), [&[0], first.pixels.shape()].concat()),
+            _ => (
+                views.iter().map(|view| view.pixels.shape()[0]).sum(),
+                first.pixels.shape().to_vec(),
+            ),
+        };
+        shape[0] = rows;
+        let mut pixels = Vec::new();
+        reserve("pixel_values", &mut pixels, product("pixel_values", &shape)?)?;
+        for view in &views {
+            pixels.extend_from_slice(view.pixels.data());
+        }
+        Ok(vec![OwnedArray::new(pixels, &shape)?])
+    }
+}
+
+/// The names of the views in this order, if every view has one.
+fn names(observation: &Observation<'_>, order: &[usize]) -> Option<Vec<String>> {
+    let name = |&index: &usize| observation.views[index].0.map(str::to_owned);
+    order.iter().map(name).collect()
+}
+
+fn show_views(observation: &Observation<'_>, names: Option<Vec<String>>) -> String {
+    match names {
+        Some(names) => names.join(", "),
+        None => format!("{} views", observation.views.len()),
+    }
+}

@@ -1,0 +1,279 @@
+//! lerobot's checkpoints, whose `config.json` describes a policy and holds no size of the head. Sizes come from the tensors; what no shape
+//! determines is taken from the published models.
+
+use std::path::Path;
+
+use saccade_vla_checkpoint::{OWN_CONFIG, read_text};
+use serde_json::{Map, Value, json};
+
+use super::layout::{CheckpointLayout, Clues, Evidence};
+use super::sizes::{self, BLOCKS, FUTURE_TOKENS, HeadShapes, add_decoders, proved};
+use crate::config::{Feature, OWN_KEY, Object, Version, WholeConfig};
+use crate::error::{Error, Result};
+
+/// lerobot's: everything under `_groot_model.`, the policy's `config.json`.
+pub(super) struct Lerobot;
+
+/// lerobot's, of a fork with several action decoders.
+pub(super) struct Fork;
+
+const PREFIX: &str = "_groot_model.action_head.";
+
+/// `type` in lerobot's `config.json` of a GR00T policy.
+const POLICY: &str = "groot";
+
+/// The versions that lerobot reads.
+const VERSIONS: [Version; 2] = [Version::N15, Version::N17];
+
+impl CheckpointLayout for Lerobot {
+    fn name(&self) -> &'static str {
+        "lerobot"
+    }
+
+    fn prefix(&self) -> Option<&'static str> {
+        Some(PREFIX)
+    }
+
+    fn matches(&self, clues: &Clues<'_>) -> bool {
+        clues.tensors.prefix == PREFIX || clues.config.top().contains_key("type")
+    }
+
+    fn is_without_head(&self, config: &WholeConfig) -> Result<bool> {
+        match config.top().get("type") {
+            _ if config.is_nested() => Ok(false),
+            None => Ok(false),
+            Some(Value::String(policy)) if policy == POLICY => Ok(true),
+            Some(policy) => Err(Error::Checkpoint(format!(
+                "config: type is {policy}: lerobot's config of another policy, expected \"{POLICY}\""
+            ))),
+        }
+    }
+
+    fn add_evidence(&self, clues: &Clues<'_>, found: &mut Vec<Evidence>) {
+        if clues.has_head_config {
+            return;
+        }
+        found.push(Evidence {
+            versions: VERSIONS.to_vec(),
+            what: format!("config.json is lerobot's, type \"{POLICY}\""),
+        });
+        if let Some(Value::String(base)) = clues.config.top().get("base_model_path")
+            && let Some(version) = Version::in_path(base)
+        {
+            found.push(Evidence {
+                versions: vec![version],
+                what: format!("base_model_path is \"{base}\""),
+            });
+        }
+    }
+
+    fn head_config(&self, clues: &Clues<'_>, version: Version) -> Result<(Object, Vec<String>)> {
+        if clues.has_head_config {
+            return Ok(sizes::complete(clues.config.head(), version, &clues.tensors));
+        }
+        let mut head = from_tensors(clues.config.top(), version, &clues.tensors)?;
+        if let Some(own) = own_config(clues.directory)? {
+            head.insert(OWN_KEY.to_owned(), own);
+        }
+        Ok((head, Vec::new()))
+    }
+}
+
+impl CheckpointLayout for Fork {
+    fn name(&self) -> &'static str {
+        "fork"
+    }
+
+    fn prefix(&self) -> Option<&'static str> {
+        Lerobot.prefix()
+    }
+
+    fn matches(&self, clues: &Clues<'_>) -> bool {
+        clues.tensors.has_several_decoders()
+    }
+
+    fn add_evidence(&self, clues: &Clues<'_>, found: &mut Vec<Evidence>) {
+        Lerobot.add_evidence(clues, found);
+    }
+
+    fn head_config(&self, clues: &Clues<'_>, version: Version) -> Result<(Object, Vec<String>)> {
+        Lerobot.head_config(clues, version)
+    }
+}
+
+/// Widths of an attention head in every published model.
+const DIT_HEAD_DIM: usize = 48;
+const VL_HEAD_DIM: usize = 64;
+
+/// Actions that a model denoises. lerobot keeps the number of the model that a policy was made from, and nothing that it saves holds it:
+/// `chunk_size`, and the `action_horizon` of its processors (which may be `chunk_size` again, or the most that Isaac-GR00T's processor
+/// takes), say what is trained and cut, not what is denoised. These are the published models'; a fine-tune by Isaac-GR00T keeps them too,
+/// since its trainer takes the model's config from where it starts.
+const N15_HORIZON: u64 = 16;
+const N17_HORIZON: u64 = 40;
+
+/// The head's config where the file holds none of it: sizes from the tensors, the rest as the published models of that version have it.
+fn from_tensors(policy: &Object, version: Version, tensors: &HeadShapes<'_>) -> Result<Object> {
+    let number = |key: &str| policy.get(key).and_then(Value::as_u64);
+    let sizes = proved(version, tensors);
+    let mut head = Map::new();
+    head.insert("model_type".to_owned(), json!(version.model_type()));
+    for (key, size, _) in &sizes {
+        head.insert((*key).to_owned(), json!(size));
+    }
+    let mut problems = Vec::new();
+    add_transformers(&mut head, version, tensors, &mut problems);
+    let state = state_sizes(policy, version, tensors);
+    head.insert("max_state_dim".to_owned(), json!(state.found));
+    let mut set = |key: &str, value: Value| head.insert(key.to_owned(), value);
+    set("add_pos_embed", json!(tensors.any("position_embedding.")));
+    set("use_vlln", json!(tensors.any("vlln.")));
+    set("num_timestep_buckets", json!(1000));
+    let steps = number("num_inference_timesteps").unwrap_or(4);
+    set("num_inference_timesteps", json!(steps));
+    if version.is_flat() {
+        set("use_alternate_vl_dit", json!(true));
+        set("attend_text_every_n_blocks", json!(2));
+        set("state_history_length", json!(state.history));
+        set("action_horizon", json!(N17_HORIZON));
+    } else {
+        let tokens = tensors.size(FUTURE_TOKENS, 2, 0).unwrap_or(0);
+        set("num_target_vision_tokens", json!(tokens));
+        set("action_horizon", json!(N15_HORIZON));
+    }
+    add_decoders(&mut head, tensors);
+    let action_dim = number("max_action_dim").map(|dim| widened(version, dim, 32));
+    let actions = tensors.size("action_encoder.W1.W", 3, 1).unwrap_or(0) as u64;
+    for (key, given, name, found) in [
+        (
+            "max_state_dim",
+            state.given,
+            "state_encoder.layer1.W",
+            state.found,
+        ),
+        ("max_action_dim", action_dim, "action_encoder.W1.W", actions),
+    ] {
+        if let Some(given) = given.filter(|given| *given != found) {
+            let shown = tensors.show(name);
+            problems.push(format!("{key} is {given} in the config, but {shown}"));
+        }
+    }
+    if problems.is_empty() {
+        return Ok(head);
+    }
+    Err(Error::Checkpoint(format!(
+        "source: config.json (lerobot's, GR00T {}) and tensors do not make a head; the head's own config can be given as \
+         `config`:\n  {}",
+        version.title(),
+        problems.join("\n  ")
+    )))
+}
+
+/// Adds both transformers' configs, and to `problems` what the tensors do not determine.
+fn add_transformers(
+    head: &mut Object,
+    version: Version,
+    tensors: &HeadShapes<'_>,
+    problems: &mut Vec<String>,
+) {
+    let mut needed = |key: &str| {
+        let size = head
+            .get(key)
+            .and_then(Value::as_u64)
+            .and_then(|size| usize::try_from(size).ok());
+        size.unwrap_or_else(|| {
+            problems.push(format!(
+                "{key} is not in lerobot's config.json, and no tensor tells it"
+            ));
+            1
+        })
+    };
+    let (width, context) = (needed("input_embedding_dim"), needed("backbone_embedding_dim"));
+    let hidden = needed("hidden_size");
+    let mut heads = |what: &str, width: usize, head_dim: usize| {
+        if !width.is_multiple_of(head_dim) {
+            problems.push(format!(
+                "{what} is {width}: not a multiple of {head_dim}, the width of an attention head in GR00T {}; lerobot's config.json \
+                 does not say how wide they are here",
+                version.title()
+            ));
+        }
+        width / head_dim
+    };
+    let [(dit_key, dit_blocks), (vl_key, vl_blocks)] = BLOCKS;
+    let mut dit = json!({
+        "attention_head_dim": DIT_HEAD_DIM,
+        "interleave_self_attention": true,
+        "norm_type": "ada_norm",
+        "num_attention_heads": heads("input_embedding_dim", width, DIT_HEAD_DIM),
+        "num_layers": tensors.blocks(dit_blocks),
+        "output_dim": hidden,
+        "positional_embeddings": null,
+    });
+    if !version.is_flat() {
+        dit["cross_attention_dim"] = json!(context);
+    }
+    let vl_layers = tensors.blocks(vl_blocks);
+    if vl_layers > 0 || version == Version::N15 {
+        let vl = json!({
+            "attention_head_dim": VL_HEAD_DIM,
+            "num_attention_heads": heads("backbone_embedding_dim", context, VL_HEAD_DIM),
+            "num_layers": vl_layers,
+            "positional_embeddings": null,
+        });
+        head.insert(vl_key.to_owned(), vl);
+    }
+    head.insert(dit_key.to_owned(), dit);
+}
+
+/// The width of a state: by the policy's config, by the tensors, and how many of them make the state row.
+struct StateSizes {
+    given: Option<u64>,
+    found: u64,
+    history: u64,
+}
+
+fn state_sizes(policy: &Object, version: Version, tensors: &HeadShapes<'_>) -> StateSizes {
+    let inputs = tensors.size("state_encoder.layer1.W", 3, 1).unwrap_or(1) as u64;
+    let given = policy.get("max_state_dim").and_then(Value::as_u64);
+    let given = given.map(|dim| widened(version, dim, 64));
+    let history = match given {
+        // An encoder without inputs is refused later, by its size.
+        Some(dim) if version.has(Feature::StateHistory) && dim > 0 && inputs.is_multiple_of(dim) => {
+            (inputs / dim).max(1)
+        }
+        _ => 1,
+    };
+    StateSizes {
+        given,
+        found: inputs / history,
+        history,
+    }
+}
+
+/// The width that lerobot pads to for N1.7, whose policies may still have the `default` of N1.5 in their config.
+fn widened(version: Version, dim: u64, default: u64) -> u64 {
+    match version {
+        Version::N17 if dim == default => 132,
+        _ => dim,
+    }
+}
+
+/// Saccade's own part of the head's config: in a separate file, since lerobot refuses a `config.json` with keys that it does not know.
+fn own_config(directory: &Path) -> Result<Option<Value>> {
+    let path = directory.join(OWN_CONFIG);
+    if !path.exists() {
+        return Ok(None);
+    }
+    let own = serde_json::from_str(&read_text("source", &path)?).map_err(|source| Error::Json {
+        what: format!("source: {}", path.display()),
+        source,
+    })?;
+    match own {
+        Value::Object(_) => Ok(Some(own)),
+        _ => Err(Error::Checkpoint(format!(
+            "source: {}: expected a JSON object",
+            path.display()
+        ))),
+    }
+}

@@ -1,0 +1,363 @@
+//! LoRA adapters of PEFT, merged into the weights of their base: `W + scaling * B A`.
+//!
+//! As PEFT's `merge_and_unload` on a CPU: the product and the sum are computed in float32, also for weights of 16 bits, and the sum is rounded to
+//! the type of the weight. The bits are those of torch's matrix product on x86; other libraries may add in another order.
+
+mod config;
+mod delta;
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+
+use saccade_vla_checkpoint::{
+    ADAPTER_CONFIG, ADAPTER_WEIGHTS, Checkpoint, Dtype, plain_name, read_text, show_shape,
+};
+use serde_json::value::RawValue;
+
+use crate::error::{Error, Result};
+use crate::recognise::Published;
+use crate::rewrite::float::Float;
+use crate::rewrite::json_edit::{find, span};
+use config::{AdapterConfig, Names, is_end};
+use delta::Factors;
+
+pub(crate) use delta::Delta;
+
+/// What the names of an adapter's tensors begin with, before the names of its base.
+const PREFIX: &str = "base_model.model.";
+
+/// Problems that a message lists.
+const SHOWN: usize = 20;
+
+/// What becomes of a tensor of the base.
+enum Change {
+    Add(Factors),
+    /// The tensor of the adapter's file that takes its place.
+    Replace(String),
+}
+
+/// An adapter that fits its base.
+pub(crate) struct Adapter {
+    checkpoint: Checkpoint,
+    /// By the names of the base's tensors.
+    changes: BTreeMap<String, Change>,
+}
+
+/// Opens the checkpoint `source`, to which an adapter may be added: the one in the directory `adapter` may then be beside its weights, and its
+/// `config.json`, if it has one, takes the place of the base's, as in lerobot.
+///
+/// # Errors
+/// As [`Published::open`].
+pub fn open_base(source: &Path, config: Option<&str>, adapter: Option<&Path>) -> Result<Published> {
+    let Some(adapter) = adapter else {
+        return Published::open(source, config);
+    };
+    let own = match config {
+        Some(_) => None,
+        None => own_config(adapter)?,
+    };
+    let checkpoint = match is_beside(source, adapter) {
+        true => Checkpoint::open_beside_adapter(source)?,
+        false => Checkpoint::open(source)?,
+    };
+    Published::of(checkpoint, source, config.or(own.as_deref()))
+}
+
+/// Whether the adapter is in the directory of its base.
+pub(crate) fn is_beside(source: &Path, adapter: &Path) -> bool {
+    let folder = match source.parent() {
+        Some(parent) if !source.is_dir() => parent,
+        _ => source,
+    };
+    let folder = if folder == Path::new("") {
+        Path::new(".")
+    } else {
+        folder
+    };
+    matches!((folder.canonicalize(), adapter.canonicalize()), (Ok(one), Ok(two)) if one == two)
+}
+
+/// The `config.json` of an adapter, in which `use_peft` is false: lerobot's says that there is one.
+fn own_config(adapter: &Path) -> Result<Option<String>> {
+    let path = adapter.join("config.json");
+    if !path.exists() {
+        return Ok(None);
+    }
+    let text = read_text("adapter", &path)?;
+    let whole: &RawValue = serde_json::from_str(&text).map_err(|source| Error::Json {
+        what: format!("adapter: {}", path.display()),
+        source,
+    })?;
+    let mut values = Vec::new();
+    find("", whole, &mut values)?;
+    let switch = values.iter().find(|value| value.path == "use_peft");
+    Ok(Some(match switch {
+        None => text,
+        Some(switch) => {
+            let place = span(&text, switch.value);
+            format!("{}false{}", &text[..place.start], &text[place.end..])
+        }
+    }))
+}
+
+impl Adapter {
+    /// Opens the adapter in `directory` for the checkpoint `base`.
+    ///
+    /// # Errors
+    /// [`Error::File`] for files that are not there or broken; [`Error::Checkpoint`] for an adapter of another kind, for one that does not fit
+    /// the base, and for a base in int8.
+    pub(crate) fn open(directory: &Path, base: &Checkpoint) -> Result<Self> {
+        if !directory.is_dir() {
+            return Err(Error::Input(format!(
+                "adapter: expected a directory with {ADAPTER_CONFIG} and {ADAPTER_WEIGHTS}, got {}",
+                directory.display()
+            )));
+        }
+        let config = AdapterConfig::read(directory)?;
+        let checkpoint = Checkpoint::open_file(&weights_of(directory)?)?;
+        if let Some(name) = base
+            .names()
+            .find(|name| matches!(base.dtype(name), Ok(Dtype::I8)))
+        {
+            return Err(Error::Checkpoint(format!(
+                "source: {name} is I8: expected weights that are not quantised; merge the adapter first, then quantise"
+            )));
+        }
+        let mut changes = BTreeMap::new();
+        let mut problems = Vec::new();
+        for name in checkpoint.names() {
+            match change_of(name, &checkpoint, base, &config) {
+                Ok(Some((target, _))) if changes.contains_key(&target) => {
+                    problems.push(format!(
+                        "{name}: another tensor of the adapter changes {target} too"
+                    ));
+                }
+                Ok(Some((target, change))) => {
+                    changes.insert(target, change);
+                }
+                Ok(None) => {}
+                Err(problem) => problems.push(problem),
+            }
+        }
+        problems.extend(left_over(&changes, base, &config));
+        if problems.is_empty() {
+            return Ok(Self { checkpoint, changes });
+        }
+        let more = problems.len().saturating_sub(SHOWN);
+        problems.truncate(SHOWN);
+        if more > 0 {
+            problems.push(format!("and {more} more"));
+        }
+        Err(Error::Checkpoint(format!(
+            "adapter: {} does not fit the base:\n  {}",
+            directory.display(),
+            problems.join("\n  ")
+        )))
+    }
+
+    /// What is added to tensor `name` of the base, if anything is.
+    pub(crate) fn delta(&self, name: &str) -> Result<Option<Delta>> {
+        match self.changes.get(name) {
+            Some(Change::Add(factors)) => Ok(Some(Delta::read(&self.checkpoint, factors)?)),
+            _ => Ok(None),
+        }
+    }
+
+    /// The adapter's file, and the tensor in it that takes the place of tensor `name` of the base, if one does.
+    pub(crate) fn replacement(&self, name: &str) -> Option<(&Checkpoint, &str)> {
+        match self.changes.get(name) {
+            Some(Change::Replace(own)) => Some((&self.checkpoint, own)),
+            _ => None,
+        }
+    }
+
+    /// Numbers of weights that are added to, and of tensors that are replaced.
+    pub(crate) fn counts(&self) -> (usize, usize) {
+        let is_added = |change: &&Change| matches!(change, Change::Add(_));
+        let added = self.changes.values().filter(is_added).count();
+        (added, self.changes.len() - added)
+    }
+}
+
+fn weights_of(directory: &Path) -> Result<PathBuf> {
+    let weights = directory.join(ADAPTER_WEIGHTS);
+    if !weights.exists() && directory.join("adapter_model.bin").exists() {
+        return Err(Error::Checkpoint(format!(
+            "adapter: {} holds adapter_model.bin, expected {ADAPTER_WEIGHTS}: save it again with PEFT's save_pretrained, which writes that",
+            directory.display()
+        )));
+    }
+    Ok(weights)
+}
+
+/// The tensor of the base that the adapter's tensor `name` changes, and how; none for the second factor of a product.
+fn change_of(
+    name: &str,
+    checkpoint: &Checkpoint,
+    base: &Checkpoint,
+    config: &AdapterConfig,
+) -> std::result::Result<Option<(String, Change)>, String> {
+    let Some(inner) = name.strip_prefix(PREFIX) else {
+        return Err(format!("{name}: expected a name that begins with {PREFIX}"));
+    };
+    let inner = plain_name(inner);
+    for (a, b, is_embedding) in [
+        (".lora_A.weight", ".lora_B.weight", false),
+        (".lora_embedding_A", ".lora_embedding_B", true),
+    ] {
+        let (own, other) = (inner.strip_suffix(a), inner.strip_suffix(b));
+        let Some(module) = own.or(other) else { continue };
+        let (end, wanted) = if own.is_some() { (a, b) } else { (b, a) };
+        let pair = format!("{}{wanted}", &name[..name.len() - end.len()]);
+        if checkpoint.shape(&pair).is_none() {
+            return Err(format!("{name} is there without {pair}"));
+        }
+        if own.is_none() {
+            return Ok(None);
+        }
+        if !config.adapts(module) {
+            return Err(format!(
+                "{name}: {module} is not one of target_modules: PEFT would ignore it"
+            ));
+        }
+        let factors = factors(module, name, &pair, is_embedding, checkpoint, base, config)?;
+        return Ok(Some((format!("{module}.weight"), Change::Add(factors))));
+    }
+    if config.saved.iter().any(|end| saves(end, &inner)) {
+        return replacement(&inner, name, checkpoint, base);
+    }
+    Err(format!(
+        "{name}: expected a lora_A or lora_B, or a tensor of modules_to_save"
+    ))
+}
+
+/// Whether tensor `name` is in a module whose name ends so. PEFT compares letters here, not parts of the path.
+fn saves(end: &str, name: &str) -> bool {
+    name.match_indices('.').any(|(dot, _)| name[..dot].ends_with(end))
+}
+
+fn replacement(
+    target: &str,
+    name: &str,
+    checkpoint: &Checkpoint,
+    base: &Checkpoint,
+) -> std::result::Result<Option<(String, Change)>, String> {
+    let shape = checkpoint.shape(name).unwrap_or_default();
+    match base.shape(target) {
+        None => Err(format!("{name}: {}", missing(target, base))),
+        Some(there) if there != shape => Err(format!(
+            "{name} has shape {}, expected {}",
+            show_shape(shape),
+            show_shape(there)
+        )),
+        Some(_) => {
+            let types = [base.dtype(target), checkpoint.dtype(name)];
+            match types.map(|dtype| dtype.ok().and_then(Float::of)) {
+                [Some(_), Some(_)] => Ok(Some((target.to_owned(), Change::Replace(name.to_owned())))),
+                _ => Err(format!(
+                    "{name}: expected F32, BF16 or F16 in the adapter and in the base"
+                )),
+            }
+        }
+    }
+}
+
+fn factors(
+    module: &str,
+    a: &str,
+    b: &str,
+    is_embedding: bool,
+    checkpoint: &Checkpoint,
+    base: &Checkpoint,
+    config: &AdapterConfig,
+) -> std::result::Result<Factors, String> {
+    let target = format!("{module}.weight");
+    let Some(weight) = base.shape(&target) else {
+        return Err(format!("{a}: {}", missing(&target, base)));
+    };
+    let (shape_a, shape_b) = (
+        checkpoint.shape(a).unwrap_or_default(),
+        checkpoint.shape(b).unwrap_or_default(),
+    );
+    let (rank, scaling) = config.scaling(module);
+    let shown = format!(
+        "{a} {}, {b} {} and {target} {}",
+        show_shape(shape_a),
+        show_shape(shape_b),
+        show_shape(weight)
+    );
+    let fits = match (is_embedding, weight) {
+        (true, &[rows, columns]) => shape_a == [rank as usize, rows] && shape_b == [columns, rank as usize],
+        // The second layer of a convolution has a kernel of one.
+        (false, [rows, columns @ ..]) if !columns.is_empty() => {
+            shape_a.first() == Some(&(rank as usize))
+                && shape_a[1..] == *columns
+                && shape_b.get(..2) == Some(&[*rows, rank as usize])
+                && shape_b.len() == weight.len()
+                && shape_b[2..].iter().all(|&size| size == 1)
+        }
+        _ => false,
+    };
+    if !fits || weight.contains(&0) {
+        return Err(format!(
+            "{shown} do not fit each other and rank {rank} of the config"
+        ));
+    }
+    let types = [base.dtype(&target), checkpoint.dtype(a), checkpoint.dtype(b)];
+    if types
+        .iter()
+        .any(|dtype| dtype.as_ref().ok().copied().and_then(Float::of).is_none())
+    {
+        return Err(format!("{shown}: expected F32, BF16 or F16"));
+    }
+    Ok(Factors {
+        a: a.to_owned(),
+        b: b.to_owned(),
+        is_embedding,
+        rows: weight[0],
+        columns: weight[1..].iter().product(),
+        rank: rank as usize,
+        scaling,
+    })
+}
+
+/// That the base has no tensor `target`, and whose names it may have instead.
+fn missing(target: &str, base: &Checkpoint) -> String {
+    const LEROBOT: &str = "_groot_model.";
+    let is_lerobot = base.names().any(|name| name.starts_with(LEROBOT));
+    let hint = match (target.starts_with(LEROBOT), is_lerobot) {
+        (true, false) => ": the adapter is of a checkpoint in lerobot's layout, the base is not",
+        (false, true) => ": the base is in lerobot's layout, the adapter is of another",
+        _ => "",
+    };
+    format!("the base has no {target}{hint}")
+}
+
+/// Names in the config that nothing in the adapter's file fits, and tensors of the base that the file should replace.
+fn left_over(changes: &BTreeMap<String, Change>, base: &Checkpoint, config: &AdapterConfig) -> Vec<String> {
+    let modules: Vec<&str> = changes
+        .iter()
+        .filter(|(_, change)| matches!(change, Change::Add(_)))
+        .filter_map(|(name, _)| name.strip_suffix(".weight"))
+        .collect();
+    let nothing = |what: &str| format!("target_modules: {what} fits no tensor of the adapter");
+    let mut problems = match &config.targets {
+        Names::Ends(ends) => {
+            let unused = ends
+                .iter()
+                .filter(|end| !modules.iter().any(|module| is_end(end, module)));
+            unused.map(|end| nothing(end)).collect()
+        }
+        Names::Pattern(_) if modules.is_empty() => vec![nothing("its pattern")],
+        Names::Pattern(_) => Vec::new(),
+    };
+    for end in &config.saved {
+        let in_base: Vec<&str> = base.names().filter(|name| saves(end, name)).collect();
+        if in_base.is_empty() {
+            problems.push(format!("modules_to_save: {end} fits no tensor of the base"));
+        }
+        let absent = in_base.into_iter().filter(|name| !changes.contains_key(*name));
+        problems.extend(absent.map(|name| format!("{name} of modules_to_save is not in the adapter")));
+    }
+    problems
+}

@@ -1,0 +1,219 @@
+//! Quantised checkpoints: the weights that are multiplied in int8, stored as int8.
+
+use std::collections::BTreeSet;
+use std::path::Path;
+
+use saccade_vla_checkpoint::spec::SCALE_SUFFIX;
+use saccade_vla_checkpoint::{Checkpoint, CheckpointWriter, Dtype, PlannedTensor, TensorSpec, reserve};
+use saccade_vla_kernels::quantize_rows;
+
+use crate::alloc::filled;
+use crate::backbone::PublishedBackbone;
+use crate::error::{Error, Result};
+use crate::head::plan::tensor_specs;
+use crate::nn::weights::weight_view;
+use crate::ops::check_interrupted;
+use crate::rewrite::float::Float;
+use crate::rewrite::{RewriteOptions, SourceCheckpoint, Written};
+
+/// What [`quantize`] wrote.
+#[derive(Clone, Debug)]
+pub struct QuantizeReport {
+    /// The files.
+    pub written: Written,
+    /// Weights that were quantised.
+    pub num_quantized: usize,
+    /// Tensors copied bit for bit.
+    pub num_copied: usize,
+    /// Bytes of the head's tensors before.
+    pub head_bytes_before: u64,
+    /// Bytes of the head's tensors after, including scales.
+    pub head_bytes_after: u64,
+    /// How many of the quantised weights are those of a backbone.
+    pub num_quantized_backbone: usize,
+    /// Bytes of the backbone's tensors before; 0 without a backbone that is quantised.
+    pub backbone_bytes_before: u64,
+    /// Bytes of the backbone's tensors after, including scales.
+    pub backbone_bytes_after: u64,
+    /// Why the tensors outside the head were copied bit for bit; none if they are those of a backbone that is quantised, or if there are none.
+    pub backbone_copied: Option<String>,
+}
+
+/// Writes the checkpoint `source` to the directory `out` with the weights of the blocks' linear layers in int8, `X.weight (out, in)`
+/// and float32 `X.weight_scale (out)`, by [`quantize_rows`]: what [`Precision::Int8`](crate::Precision::Int8) computes with, so that
+/// loading the result at that precision gives the same bits as loading `source` at it. So are the blocks of a backbone, if there is one that
+/// [`Backbone`](crate::Backbone) loads. All other tensors are copied bit for bit.
+///
+/// One tensor is in memory at a time. `progress(done, total)`, in bytes read, is called after each tensor; if it returns false, nothing is
+/// written.
+///
+/// # Errors
+/// Of kind [`Checkpoint`](crate::ErrorKind::Checkpoint) for a source that is broken, does not fit its config or is quantised already, and for
+/// weights of the head that are not finite; [`Input`](crate::ErrorKind::Input) if `out` exists and `force` is not set, holds anything but a
+/// checkpoint, or is the source; [`Output`](crate::ErrorKind::Output) if it cannot be written.
+pub fn quantize(
+    source: &Path,
+    out: &Path,
+    options: &RewriteOptions,
+    mut progress: impl FnMut(u64, u64) -> bool,
+) -> Result<QuantizeReport> {
+    let source = SourceCheckpoint::open(source, options.config.as_deref())?;
+    let backbone = backbone_of(&source, options)?;
+    let head_specs = tensor_specs(&source.config)?;
+    let of_backbone = backbone.as_ref().ok().and_then(Option::as_ref);
+    let backbone_prefix = of_backbone.map(PublishedBackbone::prefix);
+    let mut weights = Names::default();
+    weights.add(source.prefix, &head_specs);
+    if let Some(backbone) = of_backbone {
+        weights.add(backbone.prefix(), backbone.specs());
+    }
+    if let Some(name) = weights
+        .int8
+        .iter()
+        .find(|name| matches!(source.checkpoint.dtype(name), Ok(Dtype::I8)))
+    {
+        return Err(Error::Checkpoint(format!(
+            "source: it is quantised already: {name} is I8, expected F32, BF16 or F16"
+        )));
+    }
+    let mut planned = Vec::new();
+    let mut report = QuantizeReport {
+        written: Written::default(),
+        num_quantized: 0,
+        num_copied: 0,
+        head_bytes_before: 0,
+        head_bytes_after: 0,
+        num_quantized_backbone: 0,
+        backbone_bytes_before: 0,
+        backbone_bytes_after: 0,
+        backbone_copied: backbone.as_ref().err().cloned(),
+    };
+    for name in source.names(options) {
+        let mut tensors = vec![source.as_it_is(name)?];
+        let is_backbone = backbone_prefix.is_some_and(|prefix| name.starts_with(prefix));
+        if weights.int8.contains(name) {
+            report.num_quantized += 1;
+            report.num_quantized_backbone += usize::from(is_backbone);
+            tensors[0].dtype = Dtype::I8;
+            tensors.push(PlannedTensor {
+                name: format!("{name}{SCALE_SUFFIX}"),
+                dtype: Dtype::F32,
+                shape: vec![source.shape(name)[0]],
+            });
+        } else {
+            report.num_copied += 1;
+        }
+        let before = source.checkpoint.nbytes(name)?;
+        let after = tensors.iter().map(PlannedTensor::nbytes).sum::<usize>() as u64;
+        if source.is_head(name) {
+            report.head_bytes_before += before;
+            report.head_bytes_after += after;
+        } else if is_backbone {
+            report.backbone_bytes_before += before;
+            report.backbone_bytes_after += after;
+        }
+        planned.extend(tensors);
+    }
+    let config = [("config.json", Some(source.given_config.as_str()))];
+    report.written = source.write(
+        out,
+        options,
+        &config,
+        planned,
+        &mut progress,
+        |name, writer| match weights.int8.contains(name) {
+            true => write_quantized(&source.checkpoint, name, source.shape(name), writer),
+            false if weights.all.contains(name) => copy_finite(&source.checkpoint, name, writer),
+            false => source.copy(name, writer),
+        },
+    )?;
+    Ok(report)
+}
+
+/// Tensors of models, by their names in the checkpoint.
+#[derive(Default)]
+struct Names {
+    all: BTreeSet<String>,
+    /// Those that may be stored as int8.
+    int8: BTreeSet<String>,
+}
+
+impl Names {
+    fn add(&mut self, prefix: &str, specs: &[TensorSpec]) {
+        for spec in specs {
+            let name = format!("{prefix}{}", spec.name);
+            if spec.may_be_int8 {
+                self.int8.insert(name.clone());
+            }
+            self.all.insert(name);
+        }
+    }
+}
+
+/// The backbone that is quantised, or why tensors outside the head are only copied; neither if there are none, or if they are left out.
+fn backbone_of(
+    source: &SourceCheckpoint,
+    options: &RewriteOptions,
+) -> Result<std::result::Result<Option<PublishedBackbone>, String>> {
+    let has_others = source.checkpoint.names().any(|name| !source.is_head(name));
+    if options.head_only || !has_others {
+        return Ok(Ok(None));
+    }
+    if options.keep_backbone {
+        return Ok(Err("as requested".to_owned()));
+    }
+    match PublishedBackbone::open(&source.path, Some(&source.given_config)) {
+        Ok(backbone) => Ok(Ok(Some(backbone))),
+        // Not a backbone that saccade loads, such as one of a program's own.
+        Err(Error::Checkpoint(why)) => Ok(Err(why)),
+        Err(error) => Err(error),
+    }
+}
+
+fn write_quantized(
+    checkpoint: &Checkpoint,
+    name: &str,
+    shape: &[usize],
+    writer: &mut CheckpointWriter,
+) -> Result<()> {
+    let [out_features, in_features] = *shape else {
+        unreachable!("a linear layer's weight has two axes")
+    };
+    check_interrupted()?;
+    let weight = checkpoint.read(name)?;
+    let mut values: Vec<i8> = Vec::new();
+    reserve("source", &mut values, out_features * in_features)?;
+    values.resize(out_features * in_features, 0);
+    let mut scales = filled("source", out_features, 0.0)?;
+    quantize_rows(
+        weight_view(&weight, out_features, in_features),
+        &mut values,
+        &mut scales,
+    );
+    if let Some(row) = scales.iter().position(|scale| !(127.0 * scale).is_finite()) {
+        return Err(Error::Checkpoint(format!(
+            "source: {name} holds NaN or infinity in row {row}, expected finite weights"
+        )));
+    }
+    writer.tensor(name, bytemuck::cast_slice(&values))?;
+    let scales: Vec<u8> = scales.into_iter().flat_map(f32::to_le_bytes).collect();
+    Ok(writer.tensor(&format!("{name}{SCALE_SUFFIX}"), &scales)?)
+}
+
+/// Copies a tensor of the head bit for bit, if all its numbers are finite.
+fn copy_finite(checkpoint: &Checkpoint, name: &str, writer: &mut CheckpointWriter) -> Result<()> {
+    let Some(float) = Float::of(checkpoint.dtype(name)?) else {
+        unreachable!("a head's tensors are checked to be floating point")
+    };
+    let mut values = Vec::new();
+    checkpoint.read_bytes(name, |bytes| {
+        check_interrupted()?;
+        float.read(bytes, &mut values);
+        if let Some(bad) = values.iter().find(|value| !value.is_finite()) {
+            return Err(Error::Checkpoint(format!(
+                "source: {name} holds {bad}, expected finite weights"
+            )));
+        }
+        Ok(writer.tensor(name, bytes)?)
+    })
+}

@@ -1,0 +1,97 @@
+//! Sampling allocates nothing after the first call of a shape.
+
+use std::alloc::{GlobalAlloc, Layout, System};
+use std::path::Path;
+use std::sync::atomic::{AtomicUsize, Ordering};
+
+use saccade_vla::{ActionHead, Array, ArrayMut, Chunking, Features, LoadOptions, Sampling};
+
+struct Counting;
+
+static ALLOCATIONS: AtomicUsize = AtomicUsize::new(0);
+
+// SAFETY: the system's allocator, with a counter beside it.
+unsafe impl GlobalAlloc for Counting {
+    unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
+        ALLOCATIONS.fetch_add(1, Ordering::Relaxed);
+        // SAFETY: the caller's promise is passed on.
+        unsafe { System.alloc(layout) }
+    }
+
+    unsafe fn dealloc(&self, pointer: *mut u8, layout: Layout) {
+        // SAFETY: the caller's promise is passed on.
+        unsafe { System.dealloc(pointer, layout) }
+    }
+}
+
+#[global_allocator]
+static ALLOCATOR: Counting = Counting;
+
+/// A released head; its config stands in the file's metadata.
+fn released(name: &str, threads: usize) -> ActionHead {
+    let path = Path::new(env!("CARGO_MANIFEST_DIR"))
+        .join("../../tests/data")
+        .join(name);
+    let bytes = std::fs::read(&path).unwrap();
+    let size = usize::try_from(u64::from_le_bytes(bytes[..8].try_into().unwrap())).unwrap();
+    let header: serde_json::Value = serde_json::from_slice(&bytes[8..8 + size]).unwrap();
+    let config = header["__metadata__"]["config"].as_str().unwrap().to_owned();
+    let options = LoadOptions::default()
+        .with_config(config)
+        .with_num_threads(threads);
+    ActionHead::load(&path, &options).unwrap()
+}
+
+#[test]
+fn the_second_sample_of_a_shape_allocates_nothing() {
+    // The three kinds of head, and threads: none is like another to the code that runs.
+    for (name, threads) in [
+        ("n15_single_view.safetensors", 1),
+        ("n15_single_view.safetensors", 2),
+        ("n17_tiny.safetensors", 2),
+        ("fork_two_decoders.safetensors", 2),
+    ] {
+        let head = released(name, threads);
+        let config = head.config();
+        let (horizon, width) = (config.action_horizon, config.encoder_action_dim);
+        let features = vec![0.1; 2 * 50 * config.context_dim];
+        let image_mask: Vec<_> = (0..2 * 50).map(|token| token % 3 == 1).collect();
+        let features_shape = [2, 50, config.context_dim];
+        let features = Features::new(Array::new(&features, &features_shape).unwrap());
+        let features = features.with_image_mask(Array::new(&image_mask, &[2, 50]).unwrap());
+        let context = head.encode(&features).unwrap();
+        let (state, noise) = (
+            vec![0.2; 2 * config.state_dim],
+            vec![0.3; 2 * 3 * horizon * width],
+        );
+        let previous_chunk = vec![0.4; 2 * horizon * width];
+        let shape = [2, horizon, width];
+        let mut out = vec![0.0; 2 * 3 * horizon * config.action_dim];
+        let mut sample = |future_refresh: Option<usize>, is_chunked: bool| {
+            let chunking = Chunking::new(Array::new(&previous_chunk, &shape).unwrap(), 4, 1, 6.0);
+            let sampling = Sampling::default()
+                .with_num_samples(3)
+                .with_future_refresh(future_refresh)
+                .with_chunking(is_chunked.then_some(chunking));
+            head.sample(
+                &context,
+                Array::new(&state, &[2, config.state_dim]).unwrap(),
+                Array::new(&[1, 3], &[2]).unwrap(),
+                Array::new(&noise, &[2, 3, horizon, width]).unwrap(),
+                &sampling,
+                ArrayMut::new(&mut out, &[2, 3, horizon, config.action_dim]).unwrap(),
+            )
+            .unwrap();
+        };
+        for (future_refresh, is_chunked) in [(None, false), (Some(3), true)] {
+            sample(future_refresh, is_chunked);
+            let before = ALLOCATIONS.load(Ordering::Relaxed);
+            sample(future_refresh, is_chunked);
+            assert_eq!(
+                ALLOCATIONS.load(Ordering::Relaxed),
+                before,
+                "{name}, {threads} threads, future_refresh {future_refresh:?}"
+            );
+        }
+    }
+}

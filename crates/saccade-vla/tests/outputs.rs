@@ -1,0 +1,106 @@
+//! Arguments that are written to are checked as those that are read.
+
+use std::path::Path;
+
+use saccade_vla::{
+    ActionHead, Array, ArrayMut, CrossAttention, ElementsRef, Error, Features, KeyOptions, LoadOptions,
+    NoisyActions, Precision, Sampling, TensorView, TensorViews,
+};
+
+fn demo() -> ActionHead {
+    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../python/saccade/checkpoints/demo");
+    ActionHead::load(&path, &LoadOptions::default().with_num_threads(1)).unwrap()
+}
+
+#[test]
+fn an_out_of_the_wrong_shape_is_an_error_and_stays_as_it_is() {
+    let head = demo();
+    let config = head.config();
+    let (horizon, width) = (config.action_horizon, config.action_dim);
+    let features = vec![0.1; 2 * 7 * config.context_dim];
+    let shape = [2, 7, config.context_dim];
+    let context = head
+        .encode(&Features::new(Array::new(&features, &shape).unwrap()))
+        .unwrap();
+    let state = vec![0.0; 2 * config.state_dim];
+    let state_shape = [2, config.state_dim];
+    let state = Array::new(&state, &state_shape).unwrap();
+    let noise = vec![0.5; 2 * 3 * horizon * config.encoder_action_dim];
+    for wrong in [
+        vec![2, horizon, width],
+        vec![2, 3, horizon, width + 1],
+        vec![2, 3, horizon - 1, width],
+        vec![2 * 3 * horizon * width],
+        vec![],
+    ] {
+        let mut out = vec![7.0; wrong.iter().product()];
+        let result = head.sample(
+            &context,
+            state,
+            Array::new(&[0], &[]).unwrap(),
+            Array::new(&noise, &[2, 3, horizon, config.encoder_action_dim]).unwrap(),
+            &Sampling::default().with_num_samples(3),
+            ArrayMut::new(&mut out, &wrong).unwrap(),
+        );
+        let Err(Error::Shape(message)) = result else {
+            panic!("sample, {wrong:?}: {result:?}")
+        };
+        assert!(
+            message.starts_with("out: expected (batch, num_samples, action_horizon, action_dim) = (2, 3, "),
+            "{message}"
+        );
+        let actions_shape = [2, horizon, config.encoder_action_dim];
+        let actions = &noise[..actions_shape.iter().product()];
+        let noisy = NoisyActions {
+            actions: Array::new(actions, &actions_shape).unwrap(),
+            timestep: Array::new(&[5], &[]).unwrap(),
+        };
+        if wrong != [2, horizon, width] {
+            let out_array = ArrayMut::new(&mut out, &wrong).unwrap();
+            let ids = Array::new(&[0], &[]).unwrap();
+            let result = head.velocity(&context, state, ids, noisy, &[], out_array);
+            assert!(
+                matches!(result, Err(Error::Shape(_))),
+                "velocity, {wrong:?}: {result:?}"
+            );
+        }
+        assert!(out.iter().all(|value| *value == 7.0));
+    }
+}
+
+#[test]
+fn outputs_of_a_cross_attention_are_checked() {
+    let (square, bias) = (vec![0.1; 64], vec![0.0; 8]);
+    let mut tensors = TensorViews::new();
+    for name in ["to_q", "to_k", "to_v", "to_out.0"] {
+        let weight = TensorView::new(&[8, 8], ElementsRef::F32(&square)).unwrap();
+        tensors.insert(format!("{name}.weight"), weight);
+        let bias = TensorView::new(&[8], ElementsRef::F32(&bias)).unwrap();
+        tensors.insert(format!("{name}.bias"), bias);
+    }
+    let layer = CrossAttention::new(&tensors, 2, Precision::Float32, Some(1)).unwrap();
+    let rows = vec![0.3; 3 * 8];
+    let rows = Array::new(&rows, &[1, 3, 8]).unwrap();
+    let kv = layer.project(rows).unwrap();
+    for (out_shape, weights_shape) in [
+        ([1, 3, 7], [1, 2, 3, 3]),
+        ([3, 1, 8], [1, 2, 3, 3]),
+        ([1, 3, 8], [2, 1, 3, 3]),
+        ([1, 3, 8], [1, 2, 3, 2]),
+    ] {
+        let mut out = vec![7.0; out_shape.iter().product()];
+        let mut weights = vec![7.0; weights_shape.iter().product()];
+        let result = layer.attend(
+            rows,
+            &kv,
+            KeyOptions::default(),
+            Some(ArrayMut::new(&mut weights, &weights_shape).unwrap()),
+            ArrayMut::new(&mut out, &out_shape).unwrap(),
+        );
+        assert!(
+            matches!(result, Err(Error::Shape(_))),
+            "{out_shape:?}, {weights_shape:?}"
+        );
+        assert!(out.iter().chain(&weights).all(|value| *value == 7.0));
+    }
+}
