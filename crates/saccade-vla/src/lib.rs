@@ -16,7 +16,6 @@ mod engine;
 mod error;
 mod head;
 mod inspect;
-mod memory;
 mod nn;
 mod ops;
 mod precision;
@@ -25,6 +24,7 @@ mod profile;
 mod recognise;
 mod rewrite;
 mod sampling;
+mod standalone_cross_attention;
 mod workspaces;
 
 pub use array::{Array, ArrayMut, OwnedArray};
@@ -36,7 +36,6 @@ pub use config::HeadConfig;
 pub use error::{Error, ErrorKind, Result};
 pub use head::action_head::ActionHead;
 pub use head::context::Context;
-pub use head::cross_attention::{CrossAttention, KeyOptions, KeyValues};
 pub use head::encode::Features;
 pub use head::load::LoadOptions;
 pub use head::plan::tensor_shapes;
@@ -45,7 +44,7 @@ pub use head::velocity::NoisyActions;
 pub use inspect::groups::{Group, Groups, Tokens};
 pub use inspect::intervention::{Intervention, Patch};
 pub use inspect::trace::{Keep, Recorded, StepBlock, Trace, TraceOptions};
-pub use memory::{ElementsRef, TensorView, TensorViews};
+pub use nn::source::memory::{ElementsRef, TensorView, TensorViews};
 pub use ops::interruptible;
 pub use precision::Precision;
 pub use processor::{
@@ -68,3 +67,4 @@ pub use saccade_vla_kernels::{
 };
 pub use sampling::chunking::Chunking;
 pub use sampling::integrator::Integrator;
+pub use standalone_cross_attention::{CrossAttention, KeyOptions, KeyValues};

@@ -8,13 +8,13 @@ use saccade_vla_kernels::{Epilogue, PackedKeyValues};
 use super::features::{BackboneFeatures, BackboneRecord, EncodedPrompt, View};
 use super::inputs::{BackboneInputs, Checked, Prompt, ViewPixels};
 use super::model::{Backbone, BackboneBuffers};
-use super::positions::{language_turns, token_positions};
-use super::prefix::{longest_prefix, same_view};
 use super::qwen3::{Additions, NewRows};
+use super::reuse::{longest_prefix, same_view};
+use super::vision::positions::{language_turns, token_positions};
 use crate::alloc::{collected, filled, product, reserve, sized};
 use crate::array::{Array, OwnedArray};
 use crate::error::{Error, Result};
-use crate::nn::rotary::Rotation;
+use crate::nn::rope::Rotation;
 use crate::ops::{first_keys_values, room_for_keys_values};
 
 /// Rows of the language model that are computed together. More read the weights less often; fewer keep the activations small: at 2048 rows

@@ -13,8 +13,8 @@ use super::published::PublishedBackbone;
 use super::recognise::Found;
 use crate::engine::Engine;
 use crate::error::{Error, Result};
-use crate::memory::{self, MemorySource, TensorViews};
-use crate::nn::file::FileSource;
+use crate::nn::source::file::FileSource;
+use crate::nn::source::memory::{self, MemorySource, TensorViews};
 use crate::nn::weights::{Builder, Source};
 use crate::precision::Precision;
 

@@ -2,7 +2,6 @@
 
 mod agreement;
 pub(crate) mod config;
-mod connector;
 mod encode;
 mod features;
 mod inputs;
@@ -11,17 +10,12 @@ mod layers;
 mod load;
 mod model;
 mod plan;
-mod positions;
-mod prefix;
 mod published;
 mod qwen3;
-mod qwen3_vl;
 mod recognise;
 mod released;
-mod siglip;
+mod reuse;
 mod vision;
-mod vision_block;
-mod vision_buffers;
 
 pub use config::{BackboneConfig, LanguageConfig, VisionConfig};
 pub use encode::BackboneKeep;

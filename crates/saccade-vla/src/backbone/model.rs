@@ -5,7 +5,7 @@ use saccade_vla_kernels::{Activations, Isa};
 use super::config::BackboneConfig;
 use super::layers::BackboneLayers;
 use super::qwen3::LanguageBuffers;
-use super::vision_buffers::VisionBuffers;
+use super::vision::buffers::VisionBuffers;
 use crate::engine::Engine;
 use crate::error::Result;
 use crate::head::action_head::next_id;

@@ -7,8 +7,8 @@ use super::layers::BackboneLayers;
 use super::recognise::Found;
 use crate::engine::Engine;
 use crate::error::Result;
-use crate::nn::planner::{Plan, Planner};
-use crate::nn::sizer::Sizer;
+use crate::nn::source::planner::{Plan, Planner};
+use crate::nn::source::sizer::Sizer;
 use crate::nn::weights::Builder;
 use crate::precision::Precision;
 

@@ -10,7 +10,7 @@ use super::plan::{nbytes, plan};
 use super::recognise::Found;
 use crate::engine::Engine;
 use crate::error::{Error, Result};
-use crate::nn::planner::Plan;
+use crate::nn::source::planner::Plan;
 use crate::precision::Precision;
 
 /// A checkpoint with a backbone, open, whose tensors fit its config.

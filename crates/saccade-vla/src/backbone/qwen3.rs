@@ -11,7 +11,7 @@ use crate::nn::grouped_attention::{
     Causal, GroupedAttention, GroupedBuffers, GroupedSizes, Projections, Qkv, Sequences,
 };
 use crate::nn::rms_norm::RmsNorm;
-use crate::nn::rotary::Rotation;
+use crate::nn::rope::Rotation;
 use crate::nn::weights::Weights;
 use crate::ops::check_interrupted;
 

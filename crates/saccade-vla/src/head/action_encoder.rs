@@ -7,7 +7,7 @@ use faer::{Accum, Mat, MatRef, Par};
 use saccade_vla_kernels::{Activations, Epilogue, LinearScratch, Matrix, WeightRef, silu};
 
 use super::cache::Cache;
-use super::category::CategoryLinear;
+use super::embodiment_layers::EmbodimentLinear;
 use super::embodiments::Embodiments;
 use crate::alloc::sized;
 use crate::config::HeadConfig;
@@ -28,11 +28,11 @@ pub(super) const CACHED_BRACKETS: usize = 256;
 /// depends on embodiment and bucket only: the bracket.
 pub(crate) struct ActionEncoder {
     /// `W1 W2[0:width]`, without bias: `(encoder_action_dim -> width)`.
-    action: CategoryLinear,
+    action: EmbodimentLinear,
     /// `tau -> tau W2[width:] + b1 W2[0:width] + b2`.
-    time: CategoryLinear,
+    time: EmbodimentLinear,
     /// `W3`.
-    out: CategoryLinear,
+    out: EmbodimentLinear,
     /// Its first `action_horizon` rows, `(action_horizon, width)`; none without `add_pos_embed`.
     position_embedding: Option<Vec<f32>>,
     width: usize,
@@ -57,7 +57,7 @@ impl ActionEncoder {
     ) -> Result<Self> {
         let (width, actions) = (config.width, config.encoder_action_dim);
         let mut time = Vec::with_capacity(embodiments.ids.len());
-        let action = CategoryLinear::of(embodiments, actions, width, |id| {
+        let action = EmbodimentLinear::of(embodiments, actions, width, |id| {
             let [action, of_time] = apart(weights, embodiments, id, actions, width)?;
             time.push(of_time);
             Ok(action)
@@ -65,10 +65,10 @@ impl ActionEncoder {
         let mut time = time.into_iter();
         Ok(Self {
             action,
-            time: CategoryLinear::of(embodiments, width, width, |_| {
+            time: EmbodimentLinear::of(embodiments, width, width, |_| {
                 Ok(time.next().expect("one per loaded embodiment"))
             })?,
-            out: CategoryLinear::new(&weights.at("W3"), embodiments, width, width)?,
+            out: EmbodimentLinear::new(&weights.at("W3"), embodiments, width, width)?,
             position_embedding,
             width,
             brackets: Cache::new(CACHED_BRACKETS),

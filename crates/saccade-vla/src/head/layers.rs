@@ -1,8 +1,8 @@
 //! The layers of the head, from the names of their tensors: the one place that lists them.
 
 use super::action_encoder::ActionEncoder;
-use super::category::CategoryMlp;
 use super::dit::Dit;
+use super::embodiment_layers::EmbodimentMlp;
 use super::embodiments::Embodiments;
 use super::vl_encoder::VlEncoder;
 use crate::array::OwnedArray;
@@ -15,10 +15,10 @@ pub(crate) struct HeadLayers {
     /// `(num_future_tokens, width)`.
     pub future_tokens: OwnedArray,
     pub vl: VlEncoder,
-    pub state_encoder: CategoryMlp,
+    pub state_encoder: EmbodimentMlp,
     pub action_encoder: ActionEncoder,
     /// One for each of [`HeadConfig::decoders`]; their outputs are concatenated.
-    pub decoders: Vec<CategoryMlp>,
+    pub decoders: Vec<EmbodimentMlp>,
     pub dit: Dit,
 }
 
@@ -47,7 +47,7 @@ impl HeadLayers {
         Ok(Self {
             future_tokens: OwnedArray::new(future_tokens, &[future_rows, width])?,
             vl: VlEncoder::new(weights, config)?,
-            state_encoder: CategoryMlp::new(
+            state_encoder: EmbodimentMlp::new(
                 &weights.at("state_encoder"),
                 embodiments,
                 [states, hidden, width],
@@ -62,7 +62,7 @@ impl HeadLayers {
                 .decoders
                 .iter()
                 .map(|(name, width)| {
-                    CategoryMlp::new(&weights.at(name), embodiments, [hidden, hidden, *width])
+                    EmbodimentMlp::new(&weights.at(name), embodiments, [hidden, hidden, *width])
                 })
                 .collect::<Result<_>>()?,
             dit: Dit::new(&weights.at("model"), config)?,

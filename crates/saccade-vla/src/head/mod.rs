@@ -3,11 +3,10 @@
 mod action_encoder;
 pub(crate) mod action_head;
 mod cache;
-mod category;
 mod check;
 pub(crate) mod context;
-pub(crate) mod cross_attention;
 mod dit;
+mod embodiment_layers;
 pub(crate) mod embodiments;
 pub(crate) mod encode;
 mod layers;

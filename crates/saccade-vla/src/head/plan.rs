@@ -9,7 +9,7 @@ use super::state_dropout::STATE_DROPOUT;
 use crate::config::HeadConfig;
 use crate::engine::Engine;
 use crate::error::Result;
-use crate::nn::planner::{Plan, Planner};
+use crate::nn::source::planner::{Plan, Planner};
 use crate::nn::weights::Builder;
 use crate::precision::Precision;
 

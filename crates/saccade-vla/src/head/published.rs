@@ -7,7 +7,7 @@ use super::layers::HeadLayers;
 use super::plan::{is_unused, specs_of};
 use crate::engine::Engine;
 use crate::error::{Error, Result};
-use crate::nn::sizer::Sizer;
+use crate::nn::source::sizer::Sizer;
 use crate::nn::weights::Builder;
 use crate::precision::Precision;
 use crate::recognise::Published;

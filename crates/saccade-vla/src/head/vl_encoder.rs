@@ -11,7 +11,7 @@ use crate::engine::Engine;
 use crate::error::Result;
 use crate::inspect::trace::{Keep, Recorded, Shapes};
 use crate::nn::attention::{Attention, AttentionBuffers, Bias, SelfKeys};
-use crate::nn::mlp::{DIFFUSERS, FeedForward};
+use crate::nn::feed_forward::{DIFFUSERS, FeedForward};
 use crate::nn::norm::LayerNorm;
 use crate::nn::weights::Weights;
 use crate::ops::check_interrupted;

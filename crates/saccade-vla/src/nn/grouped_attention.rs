@@ -6,7 +6,7 @@ use saccade_vla_kernels::{Activations, Epilogue, LinearScratch, Mask, PackedKeyV
 
 use super::linear::Linear;
 use super::rms_norm::RmsNorm;
-use super::rotary::Rotation;
+use super::rope::Rotation;
 use super::weights::Weights;
 use crate::alloc::sized;
 use crate::engine::Engine;

@@ -2,16 +2,14 @@
 
 pub(crate) mod attention;
 pub(crate) mod embedding;
-pub(crate) mod file;
+pub(crate) mod feed_forward;
 pub(crate) mod gated_mlp;
 pub(crate) mod grouped_attention;
 pub(crate) mod linear;
-pub(crate) mod mlp;
 pub(crate) mod norm;
-pub(crate) mod planner;
 pub(crate) mod rms_norm;
-pub(crate) mod rotary;
-pub(crate) mod sizer;
+pub(crate) mod rope;
+pub(crate) mod source;
 #[cfg(test)]
 mod tests;
 pub(crate) mod weights;

@@ -6,18 +6,18 @@ use std::path::Path;
 use saccade_vla_checkpoint::Checkpoint;
 use saccade_vla_kernels::{Activations, Epilogue, Isa, LinearScratch};
 
+use super::feed_forward::{DIFFUSERS, FeedForward};
 use super::gated_mlp::GatedMlp;
 use super::grouped_attention::{
     Causal, GroupedAttention, GroupedBuffers, GroupedSizes, Projections, Qkv, Sequences,
 };
 use super::linear::Linear;
-use super::mlp::{DIFFUSERS, FeedForward};
 use super::rms_norm::RmsNorm;
-use super::rotary::{Rotation, one_axis};
+use super::rope::{Rotation, one_axis};
 use super::weights::{Builder, Weights};
 use crate::engine::Engine;
 use crate::error::Result;
-use crate::memory::{ElementsRef, MemorySource, TensorView, TensorViews};
+use crate::nn::source::memory::{ElementsRef, MemorySource, TensorView, TensorViews};
 use crate::ops::no_keys_values;
 use crate::precision::{Precision, Role};
 

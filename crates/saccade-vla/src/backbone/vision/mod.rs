@@ -1,15 +1,22 @@
 //! The vision tower of a backbone: SigLIP's or that of Qwen3-VL, for views of which as many are encoded together as memory should hold.
 
+mod block;
+pub(crate) mod buffers;
+mod connector;
+pub(crate) mod positions;
+mod qwen3_vl;
+mod siglip;
+
 use std::sync::Arc;
 
-use super::config::{BackboneConfig, Tower};
-use super::features::View;
-use super::inputs::{ViewPixels, num_tokens};
-use super::qwen3_vl::Qwen3Vl;
-use super::released::Names;
-use super::siglip::Siglip;
-use super::vision_buffers::VisionBuffers;
+use self::buffers::VisionBuffers;
+use self::qwen3_vl::Qwen3Vl;
+use self::siglip::Siglip;
 use crate::alloc::{collected, reserve};
+use crate::backbone::config::{BackboneConfig, Tower};
+use crate::backbone::features::View;
+use crate::backbone::inputs::{ViewPixels, num_tokens};
+use crate::backbone::released::Names;
 use crate::engine::Engine;
 use crate::error::Result;
 use crate::nn::weights::Weights;
@@ -19,13 +26,13 @@ use crate::nn::weights::Weights;
 const VISION_ROWS: usize = 2048;
 
 /// A vision tower with its connector.
-pub(super) enum Vision {
+pub(crate) enum Vision {
     Siglip(Siglip),
     Qwen3Vl(Qwen3Vl),
 }
 
 impl Vision {
-    pub(super) fn new(weights: &Weights<'_>, names: &Names, config: &BackboneConfig) -> Result<Self> {
+    pub(crate) fn new(weights: &Weights<'_>, names: &Names, config: &BackboneConfig) -> Result<Self> {
         Ok(match config.vision.tower {
             Tower::Siglip { pixels, patches } => {
                 Self::Siglip(Siglip::new(weights, names, config, (pixels, patches))?)
@@ -35,7 +42,7 @@ impl Vision {
     }
 
     /// Encodes views, each by itself; `record` keeps their patches as well.
-    pub(super) fn encode(
+    pub(crate) fn encode(
         &self,
         engine: Engine,
         config: &BackboneConfig,

@@ -2,8 +2,8 @@
 
 use saccade_vla_kernels::{Activations, Epilogue, LinearScratch};
 
-use super::config::PatchOrder;
 use crate::alloc::sized;
+use crate::backbone::config::PatchOrder;
 use crate::engine::Engine;
 use crate::error::Result;
 use crate::nn::linear::Linear;
@@ -13,20 +13,20 @@ use crate::precision::Role;
 use crate::profile::Part;
 
 /// `linear2(gelu(linear1(norm(x))))`, or one linear layer alone.
-pub(super) struct Connector {
+pub(crate) struct Connector {
     norm: Option<LayerNorm>,
     first: Linear,
     second: Option<Linear>,
 }
 
 /// What the parts of a connector are called.
-pub(super) struct ConnectorNames {
+pub(crate) struct ConnectorNames {
     pub norm: &'static str,
     pub layers: [&'static str; 2],
 }
 
 /// The width of the norm and of the three sides of the two layers.
-pub(super) struct ConnectorSizes {
+pub(crate) struct ConnectorSizes {
     pub norm: usize,
     pub input: usize,
     pub hidden: usize,
@@ -35,7 +35,7 @@ pub(super) struct ConnectorSizes {
 
 /// Memory of one call that is kept for the next.
 #[derive(Default)]
-pub(super) struct ConnectorBuffers {
+pub(crate) struct ConnectorBuffers {
     pub joined: Activations,
     pub normed: Activations,
     pub hidden: Activations,
@@ -43,7 +43,7 @@ pub(super) struct ConnectorBuffers {
 
 impl Connector {
     /// One linear layer, with a bias.
-    pub(super) fn linear(weights: &Weights<'_>, input: usize, output: usize) -> Result<Self> {
+    pub(crate) fn linear(weights: &Weights<'_>, input: usize, output: usize) -> Result<Self> {
         Ok(Self {
             norm: None,
             first: Linear::new(weights, input, output, Role::Other)?.counted(Part::Connector),
@@ -52,7 +52,7 @@ impl Connector {
     }
 
     /// A norm and two layers. The norm is over rows of `sizes.norm`, the width of a patch or of several that are joined.
-    pub(super) fn new(
+    pub(crate) fn new(
         weights: &Weights<'_>,
         names: &ConnectorNames,
         sizes: &ConnectorSizes,
@@ -69,7 +69,7 @@ impl Connector {
     }
 
     /// The tokens `out (tokens, output)` of joined patches `x (tokens, input)`.
-    pub(super) fn apply(
+    pub(crate) fn apply(
         &self,
         engine: Engine,
         x: &[f32],
@@ -94,14 +94,14 @@ impl Connector {
         second.apply(engine, hidden, Epilogue::Store, out, scratch)
     }
 
-    pub(super) fn out_features(&self) -> usize {
+    pub(crate) fn out_features(&self) -> usize {
         self.second.as_ref().unwrap_or(&self.first).out_features()
     }
 }
 
 /// Joins the squares of `merge` patches on each side of a view `x (rows * columns, width)`, row by row, to
 /// `out (rows * columns / merge^2, merge^2 * width)`.
-pub(super) fn join(merge: usize, order: PatchOrder, [rows, columns]: [usize; 2], x: &[f32], out: &mut [f32]) {
+pub(crate) fn join(merge: usize, order: PatchOrder, [rows, columns]: [usize; 2], x: &[f32], out: &mut [f32]) {
     let (width, patches) = (x.len() / (rows * columns), merge * merge);
     let squares = (0..rows)
         .step_by(merge)

@@ -2,19 +2,19 @@
 
 use saccade_vla_kernels::{Activations, Epilogue, LinearScratch};
 
-use super::config::VisionConfig;
 use crate::alloc::sized;
+use crate::backbone::config::VisionConfig;
 use crate::engine::Engine;
 use crate::error::Result;
+use crate::nn::feed_forward::FeedForward;
 use crate::nn::grouped_attention::{GroupedAttention, GroupedBuffers, GroupedSizes, Projections, Sequences};
-use crate::nn::mlp::FeedForward;
 use crate::nn::norm::LayerNorm;
-use crate::nn::rotary::Rotation;
+use crate::nn::rope::Rotation;
 use crate::nn::weights::Weights;
 use crate::precision::Role;
 
 /// What the parts of a block are called.
-pub(super) struct BlockNames {
+pub(crate) struct BlockNames {
     pub norms: [&'static str; 2],
     pub attention: &'static str,
     pub projections: Projections,
@@ -22,7 +22,7 @@ pub(super) struct BlockNames {
 }
 
 /// `x += attention(norm1(x)); x += mlp(norm2(x))`.
-pub(super) struct VisionBlock {
+pub(crate) struct VisionBlock {
     norm1: LayerNorm,
     attention: GroupedAttention,
     norm2: LayerNorm,
@@ -31,7 +31,7 @@ pub(super) struct VisionBlock {
 
 /// Memory of one call that is kept for the next.
 #[derive(Default)]
-pub(super) struct BlockBuffers {
+pub(crate) struct BlockBuffers {
     pub y: Activations,
     pub hidden: Activations,
     pub attention: GroupedBuffers,
@@ -39,7 +39,7 @@ pub(super) struct BlockBuffers {
 }
 
 impl VisionBlock {
-    pub(super) fn new(weights: &Weights<'_>, config: &VisionConfig, names: &BlockNames) -> Result<Self> {
+    pub(crate) fn new(weights: &Weights<'_>, config: &VisionConfig, names: &BlockNames) -> Result<Self> {
         let (width, eps) = (config.width, config.norm_eps as f32);
         let sizes = GroupedSizes {
             width,
@@ -64,7 +64,7 @@ impl VisionBlock {
     }
 
     /// Runs the block over the patches `x (patches, width)` of views, of which there are `views` in each.
-    pub(super) fn run(
+    pub(crate) fn run(
         &self,
         engine: Engine,
         rotation: Option<&Rotation>,

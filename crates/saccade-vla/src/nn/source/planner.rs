@@ -5,8 +5,8 @@ use std::collections::BTreeSet;
 
 use saccade_vla_checkpoint::{TensorSpec, Wanted};
 
-use super::weights::{Request, Source, Stored, Tensor};
 use crate::error::Result;
+use crate::nn::weights::{Request, Source, Stored, Tensor};
 
 /// Notes every request.
 #[derive(Default)]

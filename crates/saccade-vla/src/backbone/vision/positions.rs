@@ -1,20 +1,20 @@
 //! Positions of patches and of tokens: tables resized to a grid, and the axes that rotary positions turn with.
 
-use super::config::{BackboneConfig, VisionConfig};
-use super::inputs::{Prompt, ViewPixels};
 use crate::alloc::{collected, filled, reserve};
+use crate::backbone::config::{BackboneConfig, VisionConfig};
+use crate::backbone::inputs::{Prompt, ViewPixels};
 use crate::error::{Error, Result};
-use crate::nn::rotary::{Turn, frequencies, one_axis};
+use crate::nn::rope::{Turn, frequencies, one_axis};
 
 /// The base of the frequencies of a vision tower's rotary positions.
 const VISION_THETA: f64 = 10_000.0;
 
 /// A row or column of a resized table: rows or columns of the table, and how much each of them counts.
-pub(super) type Taps = Vec<(usize, f64)>;
+pub(crate) type Taps = Vec<(usize, f64)>;
 
 /// For each of `count` places the taps over `side` rows of a table: linear interpolation, widened where the table shrinks so that every row
 /// counts. With as many places as rows, each is its row.
-pub(super) fn antialiased(side: usize, count: usize) -> Vec<Taps> {
+pub(crate) fn antialiased(side: usize, count: usize) -> Vec<Taps> {
     let scale = side as f64 / count as f64;
     let support = scale.max(1.0);
     (0..count)
@@ -31,7 +31,7 @@ pub(super) fn antialiased(side: usize, count: usize) -> Vec<Taps> {
 }
 
 /// For each of `count` places, evenly spaced from the first to the last of `side` rows of a table, the two rows around it.
-pub(super) fn evenly_spaced(side: usize, count: usize) -> Vec<Taps> {
+pub(crate) fn evenly_spaced(side: usize, count: usize) -> Vec<Taps> {
     (0..count)
         .map(|place| {
             let at = match count {
@@ -45,7 +45,7 @@ pub(super) fn evenly_spaced(side: usize, count: usize) -> Vec<Taps> {
 }
 
 /// Adds up the rows of `table (side * side, width)` that the taps of a patch's row and column name, to `out (width)`.
-pub(super) fn interpolate(table: &[f32], side: usize, [rows, columns]: [&Taps; 2], out: &mut [f32]) {
+pub(crate) fn interpolate(table: &[f32], side: usize, [rows, columns]: [&Taps; 2], out: &mut [f32]) {
     let width = out.len();
     if let ([(row, _)], [(column, _)]) = (&rows[..], &columns[..]) {
         out.copy_from_slice(&table[(row * side + column) * width..][..width]);
@@ -64,14 +64,14 @@ pub(super) fn interpolate(table: &[f32], side: usize, [rows, columns]: [&Taps; 2
 }
 
 /// How the pairs of a vision tower's heads turn: the first half with the row of a patch, the second with its column.
-pub(super) fn vision_turns(config: &VisionConfig) -> Vec<Turn> {
+pub(crate) fn vision_turns(config: &VisionConfig) -> Vec<Turn> {
     let pairs = config.head_dim / 4;
     let of_axis = |axis| frequencies(VISION_THETA, pairs).map(move |frequency| Turn { axis, frequency });
     of_axis(0).chain(of_axis(1)).collect()
 }
 
 /// How the pairs of the language model's heads turn: all with the place in the prompt, or interleaved with time, height and width.
-pub(super) fn language_turns(config: &BackboneConfig) -> Vec<Turn> {
+pub(crate) fn language_turns(config: &BackboneConfig) -> Vec<Turn> {
     let language = &config.language;
     let mut turns = one_axis(language.rope_theta, language.head_dim);
     if let Some([_, height, width]) = language.mrope_section {
@@ -90,7 +90,7 @@ pub(super) fn language_turns(config: &BackboneConfig) -> Vec<Turn> {
 ///
 /// Without `mrope_section` it is the place in the prompt, padding counted. With it padding does not count, and a view counts as many steps
 /// as its longer side has tokens.
-pub(super) fn token_positions(
+pub(crate) fn token_positions(
     config: &BackboneConfig,
     prompt: &Prompt<'_>,
     views: &[ViewPixels<'_>],
@@ -133,7 +133,7 @@ pub(super) fn token_positions(
 }
 
 /// The row and column of each patch of a view whose patches come in squares of `merge` on each side, square by square.
-pub(super) fn patch_places(merge: usize, [rows, columns]: [usize; 2]) -> Result<Vec<[usize; 2]>> {
+pub(crate) fn patch_places(merge: usize, [rows, columns]: [usize; 2]) -> Result<Vec<[usize; 2]>> {
     let mut places = Vec::new();
     reserve("positions", &mut places, rows * columns)?;
     for row in (0..rows).step_by(merge) {

@@ -12,14 +12,14 @@ use crate::precision::Role;
 use crate::profile::Part;
 
 /// One linear layer per embodiment: `y = x W[embodiment_id] + b[embodiment_id]`. Only the slices in use are in memory.
-pub(crate) struct CategoryLinear {
+pub(crate) struct EmbodimentLinear {
     /// By embodiment id; `None` where it was not loaded.
     layers: Vec<Option<Linear>>,
     in_features: usize,
     out_features: usize,
 }
 
-impl CategoryLinear {
+impl EmbodimentLinear {
     /// From `W (num_embodiments, in_features, out_features)` and `b (num_embodiments, out_features)`.
     pub(crate) fn new(
         weights: &Weights<'_>,
@@ -89,12 +89,12 @@ impl CategoryLinear {
 }
 
 /// `layer2(relu(layer1(x)))`: the state encoder and the action decoders.
-pub(crate) struct CategoryMlp {
-    layer1: CategoryLinear,
-    layer2: CategoryLinear,
+pub(crate) struct EmbodimentMlp {
+    layer1: EmbodimentLinear,
+    layer2: EmbodimentLinear,
 }
 
-impl CategoryMlp {
+impl EmbodimentMlp {
     /// `[in_features, hidden, out_features]` of `layer1` and `layer2`.
     pub(crate) fn new(
         weights: &Weights<'_>,
@@ -102,8 +102,8 @@ impl CategoryMlp {
         [in_features, hidden, out_features]: [usize; 3],
     ) -> Result<Self> {
         Ok(Self {
-            layer1: CategoryLinear::new(&weights.at("layer1"), embodiments, in_features, hidden)?,
-            layer2: CategoryLinear::new(&weights.at("layer2"), embodiments, hidden, out_features)?,
+            layer1: EmbodimentLinear::new(&weights.at("layer1"), embodiments, in_features, hidden)?,
+            layer2: EmbodimentLinear::new(&weights.at("layer2"), embodiments, hidden, out_features)?,
         })
     }
 

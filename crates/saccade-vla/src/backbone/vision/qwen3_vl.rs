@@ -2,18 +2,18 @@
 
 use saccade_vla_kernels::{Activations, Epilogue, LinearScratch};
 
-use super::config::{BackboneConfig, CHANNELS, Tower, VisionConfig};
+use super::block::{BlockNames, VisionBlock};
+use super::buffers::{EncodedViews, VisionBuffers};
 use super::connector::{Connector, ConnectorNames, ConnectorSizes};
-use super::inputs::ViewPixels;
 use super::positions::{Taps, evenly_spaced, interpolate, patch_places, vision_turns};
-use super::vision_block::{BlockNames, VisionBlock};
-use super::vision_buffers::{EncodedViews, VisionBuffers};
 use crate::alloc::{reserve, sized};
+use crate::backbone::config::{BackboneConfig, CHANNELS, Tower, VisionConfig};
+use crate::backbone::inputs::ViewPixels;
 use crate::engine::Engine;
 use crate::error::Result;
 use crate::nn::grouped_attention::{Projections, Qkv};
 use crate::nn::linear::Linear;
-use crate::nn::rotary::{Rotation, Turn};
+use crate::nn::rope::{Rotation, Turn};
 use crate::nn::weights::Weights;
 use crate::ops::check_interrupted;
 use crate::precision::Role;
@@ -37,7 +37,7 @@ const MERGER: ConnectorNames = ConnectorNames {
 };
 
 /// Patches, blocks, and the mergers of the last block and of those in `deepstack`.
-pub(super) struct Qwen3Vl {
+pub(crate) struct Qwen3Vl {
     patch_embed: Linear,
     /// `(positions, width)`, a square.
     positions: Vec<f32>,
@@ -50,7 +50,7 @@ pub(super) struct Qwen3Vl {
 
 impl Qwen3Vl {
     /// From `patch_embed`, `pos_embed`, `blocks`, `merger` and `deepstack_merger_list`.
-    pub(super) fn new(weights: &Weights<'_>, config: &BackboneConfig) -> Result<Self> {
+    pub(crate) fn new(weights: &Weights<'_>, config: &BackboneConfig) -> Result<Self> {
         let vision = &config.vision;
         let (width, size) = (vision.width, vision.patch_size);
         let frames = match vision.tower {
@@ -92,7 +92,7 @@ impl Qwen3Vl {
     }
 
     /// The tokens of views.
-    pub(super) fn encode(
+    pub(crate) fn encode(
         &self,
         engine: Engine,
         views: &[ViewPixels<'_>],

@@ -2,14 +2,14 @@
 
 use saccade_vla_kernels::{Activations, Epilogue, LinearScratch};
 
-use super::config::{BackboneConfig, CHANNELS, PatchOrder, PixelOrder, VisionConfig};
+use super::block::{BlockNames, VisionBlock};
+use super::buffers::{EncodedViews, VisionBuffers};
 use super::connector::{Connector, ConnectorNames, ConnectorSizes, join};
-use super::inputs::ViewPixels;
 use super::positions::{Taps, antialiased, interpolate};
-use super::released::Names;
-use super::vision_block::{BlockNames, VisionBlock};
-use super::vision_buffers::{EncodedViews, VisionBuffers};
 use crate::alloc::sized;
+use crate::backbone::config::{BackboneConfig, CHANNELS, PatchOrder, PixelOrder, VisionConfig};
+use crate::backbone::inputs::ViewPixels;
+use crate::backbone::released::Names;
 use crate::engine::Engine;
 use crate::error::Result;
 use crate::nn::grouped_attention::{Projections, Qkv};
@@ -41,7 +41,7 @@ const CONNECTOR: ConnectorNames = ConnectorNames {
 const CONNECTOR_EPS: f32 = 1e-5;
 
 /// Patches, blocks, a norm, and the connector.
-pub(super) struct Siglip {
+pub(crate) struct Siglip {
     patch_embedding: Linear,
     /// `(positions, width)`, a square.
     positions: Vec<f32>,
@@ -55,7 +55,7 @@ pub(super) struct Siglip {
 
 impl Siglip {
     /// From `embeddings`, `encoder.layers` and `post_layernorm`, and from the connector.
-    pub(super) fn new(
+    pub(crate) fn new(
         weights: &Weights<'_>,
         names: &Names,
         config: &BackboneConfig,
@@ -106,7 +106,7 @@ impl Siglip {
     }
 
     /// The tokens of views, and their patches after the last norm.
-    pub(super) fn encode(
+    pub(crate) fn encode(
         &self,
         engine: Engine,
         views: &[ViewPixels<'_>],

@@ -2,13 +2,13 @@
 
 use saccade_vla_kernels::Activations;
 
+use super::block::BlockBuffers;
 use super::connector::ConnectorBuffers;
-use super::vision_block::BlockBuffers;
 use crate::alloc::filled;
 use crate::error::Result;
 
 /// What a tower makes of views, one after the other.
-pub(super) struct EncodedViews {
+pub(crate) struct EncodedViews {
     /// `(tokens, width of the language model)`.
     pub tokens: Vec<f32>,
     /// The same, to be added after the first layers of the language model.
@@ -17,7 +17,7 @@ pub(super) struct EncodedViews {
 
 impl EncodedViews {
     /// Room for `len` elements of tokens.
-    pub(super) fn new(len: usize) -> Result<Self> {
+    pub(crate) fn new(len: usize) -> Result<Self> {
         Ok(Self {
             tokens: filled("tokens of views", len, 0.0)?,
             deepstack: Vec::new(),
@@ -27,7 +27,7 @@ impl EncodedViews {
 
 /// Memory of one call that is kept for the next.
 #[derive(Default)]
-pub(super) struct VisionBuffers {
+pub(crate) struct VisionBuffers {
     /// `(patches, width)`.
     pub x: Activations,
     /// The pixels of patches, `(patches, elements)`.

@@ -3,9 +3,9 @@
 use saccade_vla_kernels::{Element, PackedLinear};
 use safetensors::Dtype;
 
-use super::weights::{Outline, Request, Source, Stored, Tensor};
 use crate::engine::Engine;
 use crate::error::Result;
+use crate::nn::weights::{Outline, Request, Source, Stored, Tensor};
 use crate::ops::packing_error;
 use crate::precision::Role;
 
