@@ -17,7 +17,7 @@ use crate::nn::linear::Linear;
 use crate::nn::weights::{Outline, Stored, Weight, Weights};
 use crate::ops::check_interrupted;
 use crate::precision::Role;
-use crate::sampling::tables::action_time;
+use crate::sampling::timestep_embedding::action_encoder_embedding;
 
 /// Brackets of the action encoder that are kept, one for each embodiment and bucket; 1.6 MB at N1.5's size.
 pub(super) const CACHED_BRACKETS: usize = 256;
@@ -119,7 +119,7 @@ impl ActionEncoder {
     ) -> Result<Arc<Vec<f32>>> {
         self.brackets.get_or_insert((embodiment_id, bucket), || {
             let mut tau = vec![0.0; self.width];
-            action_time(bucket, &mut tau);
+            action_encoder_embedding(bucket, &mut tau);
             let mut bracket = vec![0.0; self.width];
             self.time.apply(
                 engine,

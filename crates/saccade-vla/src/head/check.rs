@@ -155,17 +155,17 @@ impl ActionHead {
             timestep.check_shape("timestep", "(batch,)", &[batch])?;
         }
         let last = self.config.num_timestep_buckets - 1;
-        let mut buckets = Vec::new();
-        reserve("timestep", &mut buckets, batch)?;
+        let mut timesteps = Vec::new();
+        reserve("timestep", &mut timesteps, batch)?;
         for &given in timestep.data() {
-            let bucket = usize::try_from(given).ok().filter(|bucket| *bucket <= last);
-            buckets.push(bucket.ok_or_else(|| {
+            let timestep = usize::try_from(given).ok().filter(|timestep| *timestep <= last);
+            timesteps.push(timestep.ok_or_else(|| {
                 Error::Input(format!(
                     "timestep: expected a bucket from 0 to {last}, got {given}"
                 ))
             })?);
         }
-        buckets.resize(batch, buckets[0]);
-        Ok(buckets)
+        timesteps.resize(batch, timesteps[0]);
+        Ok(timesteps)
     }
 }

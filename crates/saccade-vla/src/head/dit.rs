@@ -20,7 +20,7 @@ use crate::nn::weights::Weights;
 use crate::ops::{self, check_interrupted};
 use crate::precision::Role;
 use crate::profile::Part;
-use crate::sampling::tables::{TIME_CHANNELS, embedding_time};
+use crate::sampling::timestep_embedding::{TIME_CHANNELS, transformer_embedding};
 
 const BLOCK_EPS: f32 = 1e-5;
 const OUTPUT_EPS: f32 = 1e-6;
@@ -211,7 +211,7 @@ impl Dit {
             Ok::<_, Error>(out)
         };
         let mut table = [0.0; TIME_CHANNELS];
-        embedding_time(timestep, &mut table);
+        transformer_embedding(timestep, &mut table);
         let [linear_1, linear_2] = &self.timestep_embedder;
         // Every use of the embedding goes through SiLU first, so it is applied here once.
         let hidden = row(linear_1, &table, Epilogue::Silu)?;

@@ -12,7 +12,8 @@ use crate::inspect::intervention::Intervention;
 use crate::inspect::trace::{Recorded, StepBlock};
 use crate::ops::check_interrupted;
 use crate::sampling::chunking::{Chunking, Seam};
-use crate::sampling::integrator::{Integrator, bucket};
+use crate::sampling::integrator::{Integrator, Velocity};
+use crate::sampling::timestep::timestep;
 
 /// How a chunk is sampled.
 ///
@@ -193,11 +194,11 @@ impl ActionHead {
         for evaluation in 0..count {
             check_interrupted()?;
             let step = evaluation / in_step;
-            let bucket = bucket(evaluation, count, self.config.num_timestep_buckets);
+            let timestep = timestep(evaluation, count, self.config.num_timestep_buckets);
             let times = &mut workspace.dit.times;
             times.clear();
             reserve("activations", times, pass.context.batch)?;
-            times.resize(pass.context.batch, self.layers.dit.time(self.engine, bucket)?);
+            times.resize(pass.context.batch, self.layers.dit.time(self.engine, timestep)?);
             let rows = if !refreshes(evaluation) {
                 ActiveRows::Actions
             } else if evaluation + 1 < count && !refreshes(evaluation + 1) {
@@ -205,7 +206,7 @@ impl ActionHead {
             } else {
                 pass.rows
             };
-            self.step_velocity(&Pass { step, rows, ..*pass }, |_| bucket, recorded, workspace)?;
+            self.step_velocity(&Pass { step, rows, ..*pass }, |_| timestep, recorded, workspace)?;
             let Workspace {
                 x,
                 start,
@@ -213,15 +214,15 @@ impl ActionHead {
                 velocity,
                 ..
             } = &mut *workspace;
-            let dt = steps.integrator.advance(evaluation % in_step, dt, x, start)?;
-            let rows = x
-                .chunks_exact_mut(self.config.encoder_action_dim)
-                .zip(velocity.chunks_exact(self.config.action_dim));
-            for ((x, v), strength) in rows.zip(strength.iter().cycle()) {
-                for (x, v) in x.iter_mut().zip(v) {
-                    *x += dt * v * strength;
-                }
-            }
+            let velocity = Velocity {
+                values: velocity,
+                action_dim: self.config.action_dim,
+                strength,
+            };
+            let width = self.config.encoder_action_dim;
+            steps
+                .integrator
+                .advance(evaluation % in_step, dt, &velocity, x, width, start)?;
         }
         Ok(())
     }

@@ -16,7 +16,7 @@ use crate::inspect::changes::Changes;
 use crate::inspect::trace::Recorded;
 use crate::precision::Precision;
 use crate::recognise::Published;
-use crate::sampling::tables::action_time;
+use crate::sampling::timestep_embedding::action_encoder_embedding;
 
 /// A released head, with the config in the file's metadata.
 fn released(name: &str) -> ActionHead {
@@ -58,7 +58,7 @@ fn context(head: &ActionHead, batch: usize) -> Context {
 }
 
 /// One velocity with all rows, or only the needed ones, in the last block.
-fn velocity(head: &ActionHead, context: &Context, bucket: usize, rows: ActiveRows) -> Vec<f32> {
+fn velocity(head: &ActionHead, context: &Context, timestep: usize, rows: ActiveRows) -> Vec<f32> {
     let mut workspace = Workspace::new();
     let config = &head.config;
     workspace
@@ -72,7 +72,10 @@ fn velocity(head: &ActionHead, context: &Context, bucket: usize, rows: ActiveRow
         .unwrap()
         .copy_from_slice(&actions);
     let times = &mut workspace.dit.times;
-    times.resize(context.batch, head.layers.dit.time(head.engine, bucket).unwrap());
+    times.resize(
+        context.batch,
+        head.layers.dit.time(head.engine, timestep).unwrap(),
+    );
     let state = numbers(context.batch * config.num_states * config.state_dim, 3);
     head.encode_state(&state, &mut workspace).unwrap();
     let changes = Changes::new(&[], head.extent(&[], context, 1).unwrap()).unwrap();
@@ -83,7 +86,7 @@ fn velocity(head: &ActionHead, context: &Context, bucket: usize, rows: ActiveRow
         step: 0,
         rows,
     };
-    head.step_velocity(&pass, |_| bucket, &mut Recorded::default(), &mut workspace)
+    head.step_velocity(&pass, |_| timestep, &mut Recorded::default(), &mut workspace)
         .unwrap();
     workspace.velocity.to_vec()
 }
@@ -101,10 +104,10 @@ fn the_last_block_on_action_rows_only_changes_no_bit() {
     for file in FILES {
         let head = released(file);
         let context = context(&head, 3);
-        for bucket in [0, 499, 999] {
-            let needed = velocity(&head, &context, bucket, ActiveRows::Needed);
-            let all = velocity(&head, &context, bucket, ActiveRows::All);
-            assert_eq!(needed, all, "{file} at {bucket}");
+        for timestep in [0, 499, 999] {
+            let needed = velocity(&head, &context, timestep, ActiveRows::Needed);
+            let all = velocity(&head, &context, timestep, ActiveRows::All);
+            assert_eq!(needed, all, "{file} at {timestep}");
         }
     }
 }
@@ -114,8 +117,8 @@ fn kept_modulations_and_brackets_change_no_bit() {
     let (head, fresh) = (released(FILES[0]), released(FILES[0]));
     let kept = context(&head, 2);
     let first = velocity(&head, &kept, 250, ActiveRows::Needed);
-    for bucket in 0..CACHED_BRACKETS + 10 {
-        velocity(&head, &kept, bucket, ActiveRows::Needed);
+    for timestep in 0..CACHED_BRACKETS + 10 {
+        velocity(&head, &kept, timestep, ActiveRows::Needed);
     }
     assert_eq!(
         velocity(&head, &kept, 250, ActiveRows::Needed),
@@ -139,7 +142,7 @@ fn the_action_encoder_taken_apart_is_the_plain_one() {
         .join("../../tests/data")
         .join(name);
     let checkpoint = crate::Checkpoint::open(&path).unwrap();
-    let (width, id, bucket) = (head.config.width, 1, 250);
+    let (width, id, timestep) = (head.config.width, 1, 250);
     let slice = |name: &str| {
         let tensor = checkpoint
             .read_slices(&format!("action_head.action_encoder.{name}"), id..id + 1)
@@ -167,10 +170,10 @@ fn the_action_encoder_taken_apart_is_the_plain_one() {
     sized(&mut workspace.x, actions.len())
         .unwrap()
         .copy_from_slice(&actions);
-    head.encode_actions(|_| bucket, &mut workspace).unwrap();
+    head.encode_actions(|_| timestep, &mut workspace).unwrap();
 
     let mut tau = vec![0.0; width];
-    action_time(bucket, &mut tau);
+    action_encoder_embedding(timestep, &mut tau);
     let table = checkpoint
         .read_f32("action_head.position_embedding.weight")
         .unwrap();

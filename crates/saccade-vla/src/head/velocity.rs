@@ -19,7 +19,7 @@ use crate::inspect::trace::{Recorded, StepBlock};
 pub struct NoisyActions<'a> {
     /// `(batch, action_horizon, encoder_action_dim)`.
     pub actions: Array<'a>,
-    /// The bucket, from 0 to `num_timestep_buckets - 1`: a scalar or `(batch,)`.
+    /// The timestep, from 0 to `num_timestep_buckets - 1`: a scalar or `(batch,)`.
     pub timestep: Array<'a, i64>,
 }
 
@@ -56,8 +56,8 @@ impl ActionHead {
             sized(&mut workspace.x, actions.data().len())?.copy_from_slice(actions.data());
             workspace.dit.times.clear();
             reserve("activations", &mut workspace.dit.times, batch)?;
-            for &bucket in &timesteps {
-                let time = self.layers.dit.time(self.engine, bucket)?;
+            for &timestep in &timesteps {
+                let time = self.layers.dit.time(self.engine, timestep)?;
                 workspace.dit.times.push(time);
             }
             let pass = Pass {
@@ -67,8 +67,8 @@ impl ActionHead {
                 step: 0,
                 rows: ActiveRows::Needed,
             };
-            let bucket = |element: usize| timesteps[element];
-            self.step_velocity(&pass, bucket, &mut Recorded::default(), workspace)?;
+            let timestep = |element: usize| timesteps[element];
+            self.step_velocity(&pass, timestep, &mut Recorded::default(), workspace)?;
             Array::new(&workspace.velocity, &shape)?.check_result("velocity")?;
             out.copy_from_slice(&workspace.velocity);
             Ok(())
@@ -95,11 +95,11 @@ impl ActionHead {
     pub(super) fn step_velocity(
         &self,
         pass: &Pass<'_>,
-        bucket: impl Fn(usize) -> usize,
+        timestep: impl Fn(usize) -> usize,
         recorded: &mut Recorded<StepBlock>,
         workspace: &mut Workspace,
     ) -> Result<()> {
-        self.encode_actions(bucket, workspace)?;
+        self.encode_actions(timestep, workspace)?;
         self.assemble_rows(pass, workspace)?;
         let Workspace { dit, output, .. } = workspace;
         self.layers
@@ -111,7 +111,7 @@ impl ActionHead {
     /// Action rows to `workspace.encoded (batch, samples, action_horizon, width)`.
     pub(super) fn encode_actions(
         &self,
-        bucket: impl Fn(usize) -> usize,
+        timestep: impl Fn(usize) -> usize,
         workspace: &mut Workspace,
     ) -> Result<()> {
         let Workspace {
@@ -124,7 +124,7 @@ impl ActionHead {
         } = workspace;
         let noisy = NoisyRows { embodiment_ids, x };
         let encoder = &self.layers.action_encoder;
-        encoder.encode(self.engine, &noisy, bucket, tokens, encoded, linear)
+        encoder.encode(self.engine, &noisy, timestep, tokens, encoded, linear)
     }
 
     /// The velocity from the transformer's output rows, to `workspace.velocity (batch, samples, action_horizon, action_dim)`.

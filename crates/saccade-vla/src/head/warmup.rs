@@ -7,7 +7,7 @@ use crate::alloc::{collected, filled, product};
 use crate::array::{Array, ArrayMut};
 use crate::config::Reads;
 use crate::error::{Error, Result};
-use crate::sampling::integrator::bucket;
+use crate::sampling::timestep::timestep;
 
 /// Elements of tokens and rows that a warm-up may ask for: 8 GB in float32, far above any batch that a CPU is given.
 const MAX_WARMUP_ELEMENTS: usize = 1 << 31;
@@ -62,8 +62,8 @@ impl ActionHead {
         let state = filled("state", product("state", &state_shape)?, 0.0)?;
         for &id in &self.embodiment_ids {
             for step in 0..config.num_steps {
-                let bucket = bucket(step, config.num_steps, config.num_timestep_buckets);
-                self.layers.action_encoder.bracket(self.engine, id, bucket)?;
+                let timestep = timestep(step, config.num_steps, config.num_timestep_buckets);
+                self.layers.action_encoder.bracket(self.engine, id, timestep)?;
             }
         }
         let embodiment_id = [self.embodiment_ids[0] as i64];

@@ -1,11 +1,11 @@
-//! How the velocity is followed from noise to actions.
+//! The integration of the velocity, from noise at flow time 0 to actions at flow time 1.
 
 use saccade_vla_kernels::Activations;
 
 use crate::alloc::sized;
 use crate::error::{Error, Result};
 
-/// How the velocity is followed from noise to actions in one step.
+/// The scheme of one integration step of length `dt`, from `x` at flow time `t`, along the velocity `v`.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum Integrator {
@@ -14,6 +14,15 @@ pub enum Integrator {
     Euler,
     /// `x + dt v(x + dt / 2 v(x, t), t + dt / 2)`: two evaluations of the velocity.
     Midpoint,
+}
+
+/// A velocity as the head computes it.
+pub(crate) struct Velocity<'a> {
+    /// `(chunks, action_horizon, action_dim)`.
+    pub values: &'a [f32],
+    pub action_dim: usize,
+    /// Factor of the velocity of each action of a chunk, `(action_horizon,)`.
+    pub strength: &'a [f32],
 }
 
 impl Integrator {
@@ -39,16 +48,19 @@ impl Integrator {
         }
     }
 
-    /// Prepares `x` for adding the velocity of evaluation number `index` of a step of length `dt`, and gives what the velocity is multiplied
-    /// by. `start` holds `x` as it was at the start of a step of two evaluations.
+    /// Moves `x (chunks, action_horizon, width)` along the velocity of evaluation number `index` of a step of length
+    /// `dt`. Elements beyond `action_dim` stay as they are. `start` holds `x` from the start of a step of two
+    /// evaluations.
     pub(crate) fn advance(
         self,
         index: usize,
         dt: f32,
+        velocity: &Velocity<'_>,
         x: &mut [f32],
+        width: usize,
         start: &mut Activations,
-    ) -> Result<f32> {
-        Ok(match (self, index) {
+    ) -> Result<()> {
+        let dt = match (self, index) {
             (Self::Euler, _) => dt,
             (Self::Midpoint, 0) => {
                 sized(start, x.len())?.copy_from_slice(x);
@@ -58,11 +70,15 @@ impl Integrator {
                 x.copy_from_slice(start);
                 dt
             }
-        })
+        };
+        let rows = x
+            .chunks_exact_mut(width)
+            .zip(velocity.values.chunks_exact(velocity.action_dim));
+        for ((x, v), strength) in rows.zip(velocity.strength.iter().cycle()) {
+            for (x, v) in x.iter_mut().zip(v) {
+                *x += dt * v * strength;
+            }
+        }
+        Ok(())
     }
-}
-
-/// The bucket of evaluation number `index` of `count` at equal times: float64, truncated, as the released sampler does.
-pub(crate) fn bucket(index: usize, count: usize, num_buckets: usize) -> usize {
-    (index as f64 / count as f64 * num_buckets as f64) as usize
 }

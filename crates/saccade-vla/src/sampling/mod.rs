@@ -1,5 +1,6 @@
-//! From noise to actions: integrators, real-time chunking, the tables of time.
+//! From noise to actions: integration of the velocity, timesteps and their embeddings, real-time chunking.
 
 pub(crate) mod chunking;
 pub(crate) mod integrator;
-pub(crate) mod tables;
+pub(crate) mod timestep;
+pub(crate) mod timestep_embedding;
