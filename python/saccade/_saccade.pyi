@@ -22,14 +22,14 @@ _Intervention = dict[str, Any]  # the fields of saccade.Intervention, mappings a
 __all__ = [
     "ActionHead",
     "Backbone",
+    "BackboneCheckpoint",
     "BackboneFeatures",
     "Context",
     "CrossAttention",
+    "HeadCheckpoint",
     "KeyValues",
     "Processor",
     "ProcessorSource",
-    "Published",
-    "PublishedBackbone",
     "__version__",
     "available_isas",
     "convert",
@@ -183,9 +183,9 @@ class Backbone:
     ) -> list[tuple[BackboneFeatures, _BackboneRecorded]]: ...
 
 @final
-class PublishedBackbone:
+class BackboneCheckpoint:
     @staticmethod
-    def open(source: str, config: str | None) -> PublishedBackbone: ...
+    def open(source: str, config: str | None) -> BackboneCheckpoint: ...
     def config(self) -> dict[str, Any]: ...
     @property
     def prefix(self) -> str: ...
@@ -272,11 +272,11 @@ class CrossAttention:
     ) -> None: ...
 
 @final
-class Published:
+class HeadCheckpoint:
     @staticmethod
-    def open(source: str, config: str | None) -> Published: ...
+    def open(source: str, config: str | None) -> HeadCheckpoint: ...
     @staticmethod
-    def open_base(source: str, config: str | None, adapter: str | None) -> Published: ...
+    def open_base(source: str, config: str | None, adapter: str | None) -> HeadCheckpoint: ...
     def config(self) -> dict[str, Any]: ...
     @property
     def config_json(self) -> str: ...

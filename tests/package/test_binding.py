@@ -22,7 +22,7 @@ def test_a_panic_in_the_core_is_an_error_that_asks_for_a_report() -> None:
 def test_readers_and_getters_of_one_checkpoint_do_not_wait_for_each_other() -> None:
     """A reader that fails makes its exception while others ask for attributes: with a lock, a deadlock."""
     released = load_released("n15_tiny")
-    published = _saccade.Published.open(str(released.path), json.dumps(released.config))
+    published = _saccade.HeadCheckpoint.open(str(released.path), json.dumps(released.config))
     failed: list[int] = []
 
     def read() -> None:

@@ -163,14 +163,14 @@ impl Backbone {
 
 /// A backbone in a checkpoint, before it is loaded.
 #[pyclass(frozen, module = "saccade._saccade")]
-pub(crate) struct PublishedBackbone(saccade_vla::PublishedBackbone);
+pub(crate) struct BackboneCheckpoint(saccade_vla::BackboneCheckpoint);
 
 #[pymethods]
-impl PublishedBackbone {
+impl BackboneCheckpoint {
     #[staticmethod]
     fn open(py: Python<'_>, source: PathBuf, config: Option<String>) -> PyResult<Self> {
         call(py, || {
-            saccade_vla::PublishedBackbone::open(&source, config.as_deref())
+            saccade_vla::BackboneCheckpoint::open(&source, config.as_deref())
         })
         .map(Self)
     }

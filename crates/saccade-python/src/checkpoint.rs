@@ -1,4 +1,4 @@
-//! `saccade._saccade.Published`: an open checkpoint and what it is.
+//! `saccade._saccade.HeadCheckpoint`: an open checkpoint and what it is.
 
 use std::collections::BTreeMap;
 use std::path::PathBuf;
@@ -72,13 +72,16 @@ type PyTensorFacts = (String, String, Vec<usize>, u64);
 
 /// An open checkpoint and what it is.
 #[pyclass(frozen, module = "saccade._saccade")]
-pub(crate) struct Published(saccade_vla::Published);
+pub(crate) struct HeadCheckpoint(saccade_vla::HeadCheckpoint);
 
 #[pymethods]
-impl Published {
+impl HeadCheckpoint {
     #[staticmethod]
     fn open(py: Python<'_>, source: PathBuf, config: Option<String>) -> PyResult<Self> {
-        call(py, || saccade_vla::Published::open(&source, config.as_deref())).map(Self)
+        call(py, || {
+            saccade_vla::HeadCheckpoint::open(&source, config.as_deref())
+        })
+        .map(Self)
     }
 
     /// The base of the adapter in a directory.

@@ -24,9 +24,9 @@ mod _saccade {
     #[pymodule_export]
     use crate::attention::{CrossAttention, KeyValues};
     #[pymodule_export]
-    use crate::backbone::{Backbone, BackboneFeatures, PublishedBackbone};
+    use crate::backbone::{Backbone, BackboneCheckpoint, BackboneFeatures};
     #[pymodule_export]
-    use crate::checkpoint::{Published, read_stored, read_tensors, tensor_names};
+    use crate::checkpoint::{HeadCheckpoint, read_stored, read_tensors, tensor_names};
     #[pymodule_export]
     use crate::config::{parse_config, tensor_shapes};
     #[pymodule_export]

@@ -29,8 +29,8 @@ mod workspaces;
 
 pub use array::{Array, ArrayMut, OwnedArray};
 pub use backbone::{
-    Backbone, BackboneConfig, BackboneFeatures, BackboneInputs, BackboneKeep, BackboneLoadOptions,
-    BackboneRecord, LanguageConfig, PublishedBackbone, VisionConfig,
+    Backbone, BackboneCheckpoint, BackboneConfig, BackboneFeatures, BackboneInputs, BackboneKeep,
+    BackboneLoadOptions, BackboneRecord, LanguageConfig, VisionConfig,
 };
 pub use config::HeadConfig;
 pub use error::{Error, ErrorKind, Result};
@@ -52,7 +52,7 @@ pub use processor::{
     TokenizerFiles, View,
 };
 pub use profile::{Counter, Part, Profile, Profiling};
-pub use recognise::{Published, TensorFacts};
+pub use recognise::{HeadCheckpoint, TensorFacts};
 pub use rewrite::adapter::open_base;
 pub use rewrite::convert::{ConvertOptions, ConvertReport, convert};
 pub use rewrite::float::Float;

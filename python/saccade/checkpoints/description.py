@@ -80,14 +80,14 @@ def describe(source: Source, config: Config = None) -> Description:
     return description_of(open_published(source, config), source)
 
 
-def open_published(source: Source, config: Config = None) -> _saccade.Published:
+def open_published(source: Source, config: Config = None) -> _saccade.HeadCheckpoint:
     """Opens a checkpoint and recognises its layout, version and config; raises as :func:`describe`."""
-    return _saccade.Published.open(
+    return _saccade.HeadCheckpoint.open(
         os.fspath(resolve(source, files=WEIGHTS)), None if config is None else to_json(config)
     )
 
 
-def description_of(published: _saccade.Published, source: Source) -> Description:
+def description_of(published: _saccade.HeadCheckpoint, source: Source) -> Description:
     """The description of an open checkpoint."""
     config = HeadConfig(**published.config())
     return Description(

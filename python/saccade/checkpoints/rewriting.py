@@ -282,7 +282,7 @@ def _rewrite(
     """The arguments that the three functions share, for the engine."""
     path = resolve(source, files=WHOLE)
     config_text = None if config is None else to_json(config)
-    published = _saccade.Published.open_base(
+    published = _saccade.HeadCheckpoint.open_base(
         os.fspath(path), config_text, None if adapter is None else os.fspath(adapter)
     )
     published.check()  # before the hash, which takes long

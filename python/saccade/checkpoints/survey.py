@@ -61,7 +61,7 @@ class Survey:
 
     def __init__(
         self,
-        published: _saccade.Published,
+        published: _saccade.HeadCheckpoint,
         head: HeadConfig,
         examine: Callable[[Slice], object] | None,
         progress: Callable[[int, int], object] | None,

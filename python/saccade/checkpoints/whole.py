@@ -61,7 +61,7 @@ def backbone_of(source: Path, config: str | None) -> BackboneFindings:
     ``config`` is JSON, or None for the checkpoint's ``config.json``.
     """
     try:
-        published = _saccade.PublishedBackbone.open(str(source), config)
+        published = _saccade.BackboneCheckpoint.open(str(source), config)
     except SaccadeError as error:
         return BackboneFindings(problem=str(error))
     processor, problem = None, None

@@ -50,7 +50,7 @@ def load_parts(
     location = locate(id_or_path, revision)
     path = location.path
     check_whole(path)
-    config = HeadConfig(**_saccade.Published.open(os.fspath(path), None).config())
+    config = HeadConfig(**_saccade.HeadCheckpoint.open(os.fspath(path), None).config())
     statistics = read_normalizer(path if normalizer is None else normalizer, embodiment, data_config, config)
     horizon = _horizon(statistics, action_horizon)
     requirements = read_requirements(path, statistics)

@@ -4,8 +4,8 @@ use std::ops::RangeInclusive;
 
 use serde_json::{Map, Value};
 
-use super::agreement::disagreements;
 use super::config::{BackboneConfig, CHANNELS, LanguageConfig, Tower, VisionConfig};
+use super::consistency::contradictions;
 use super::released::{Release, TowerKind};
 use crate::config::{Object, Version};
 use crate::error::{Error, Result};
@@ -160,7 +160,7 @@ impl Reader<'_> {
             language,
         };
         if self.problems.is_empty() {
-            self.problems = disagreements(&config);
+            self.problems = contradictions(&config);
         }
         config
     }

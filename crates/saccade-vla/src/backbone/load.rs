@@ -5,12 +5,12 @@ use std::path::Path;
 use saccade_vla_checkpoint::granted;
 use saccade_vla_checkpoint::spec::Problem;
 
+use super::checkpoint::BackboneCheckpoint;
 use super::json::GivenConfig;
 use super::layers::BackboneLayers;
 use super::model::Backbone;
 use super::plan::plan;
-use super::published::PublishedBackbone;
-use super::recognise::Found;
+use super::recognise::Recognised;
 use crate::engine::Engine;
 use crate::error::{Error, Result};
 use crate::nn::source::file::FileSource;
@@ -72,9 +72,9 @@ impl Backbone {
     /// fit each other (all that does not fit is listed); [`Error::Input`] for options out of range; [`Error::Memory`].
     pub fn load(source: &Path, options: &BackboneLoadOptions) -> Result<Self> {
         let engine = Engine::new(options.precision, options.num_threads)?;
-        let published = PublishedBackbone::open(source, options.config.as_deref())?;
+        let published = BackboneCheckpoint::open(source, options.config.as_deref())?;
         granted("source", published.nbytes_in(engine)?)?;
-        let PublishedBackbone {
+        let BackboneCheckpoint {
             checkpoint,
             found,
             plan,
@@ -94,7 +94,7 @@ impl Backbone {
     pub fn from_tensors(tensors: &TensorViews<'_>, options: &BackboneLoadOptions) -> Result<Self> {
         let engine = Engine::new(options.precision, options.num_threads)?;
         let given = GivenConfig::parse(options.config.as_deref().unwrap_or("{}"))?;
-        let found = Found::new(tensors.keys().map(String::as_str), &given)?;
+        let found = Recognised::new(tensors.keys().map(String::as_str), &given)?;
         let plan = plan(&found)?;
         let own = tensors.iter().filter_map(|(name, tensor)| {
             let name = name.strip_prefix(found.prefix)?.to_owned();
@@ -114,7 +114,7 @@ impl Backbone {
         Self::build(&MemorySource::new(&own), engine, &found)
     }
 
-    fn build(source: &dyn Source, engine: Engine, found: &Found) -> Result<Self> {
+    fn build(source: &dyn Source, engine: Engine, found: &Recognised) -> Result<Self> {
         let builder = Builder::new(source, engine);
         let layers = BackboneLayers::new(&builder.weights(), &found.names, &found.config)?;
         Ok(Self::new(found.config.clone(), engine, layers, builder.nbytes()))

@@ -1,7 +1,8 @@
 //! The vision-language backbone: camera views and words in, features for the action head out.
 
-mod agreement;
+mod checkpoint;
 pub(crate) mod config;
+mod consistency;
 mod encode;
 mod features;
 mod inputs;
@@ -10,17 +11,16 @@ mod layers;
 mod load;
 mod model;
 mod plan;
-mod published;
 mod qwen3;
 mod recognise;
 mod released;
 mod reuse;
 mod vision;
 
+pub use checkpoint::BackboneCheckpoint;
 pub use config::{BackboneConfig, LanguageConfig, VisionConfig};
 pub use encode::BackboneKeep;
 pub use features::{BackboneFeatures, BackboneRecord};
 pub use inputs::BackboneInputs;
 pub use load::BackboneLoadOptions;
 pub use model::Backbone;
-pub use published::PublishedBackbone;

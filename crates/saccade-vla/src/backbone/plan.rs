@@ -4,7 +4,7 @@ use saccade_vla_checkpoint::Dtype;
 use saccade_vla_kernels::Isa;
 
 use super::layers::BackboneLayers;
-use super::recognise::Found;
+use super::recognise::Recognised;
 use crate::engine::Engine;
 use crate::error::Result;
 use crate::nn::source::planner::{Plan, Planner};
@@ -13,7 +13,7 @@ use crate::nn::weights::Builder;
 use crate::precision::Precision;
 
 /// What a backbone reads: its tensors by name without a prefix, and their order.
-pub(super) fn plan(found: &Found) -> Result<Plan> {
+pub(super) fn plan(found: &Recognised) -> Result<Plan> {
     let planner = Planner::default();
     let engine = Engine {
         isa: Isa::best(),
@@ -29,7 +29,11 @@ pub(super) fn plan(found: &Found) -> Result<Plan> {
 }
 
 /// Bytes of the layers of a backbone whose tensors are stored as `dtype` says by name.
-pub(super) fn nbytes(found: &Found, engine: Engine, dtype: impl Fn(&str) -> Result<Dtype>) -> Result<usize> {
+pub(super) fn nbytes(
+    found: &Recognised,
+    engine: Engine,
+    dtype: impl Fn(&str) -> Result<Dtype>,
+) -> Result<usize> {
     let sizer = Sizer::new(engine, dtype);
     let builder = Builder::new(&sizer, engine);
     BackboneLayers::new(&builder.weights(), &found.names, &found.config)?;

@@ -18,14 +18,14 @@ pub(super) struct TensorNames {
 }
 
 /// A backbone in a list of tensors.
-pub(super) struct Found {
+pub(super) struct Recognised {
     pub prefix: &'static str,
     pub release: &'static Release,
     pub names: TensorNames,
     pub config: BackboneConfig,
 }
 
-impl Found {
+impl Recognised {
     /// The backbone among tensors of these names, with the config that was given for it.
     ///
     /// # Errors

@@ -4,10 +4,10 @@ use std::ops::RangeInclusive;
 
 use serde_json::{Map, Value};
 
-use super::agreement::disagreements;
+use super::checkpoint_config::{CheckpointConfig, OWN_KEY, Object};
+use super::consistency::contradictions;
 use super::head_config::{HeadConfig, MAX_SIZE};
 use super::versions::{FEATURE_KEYS, Feature, Version};
-use super::whole::{OWN_KEY, Object, WholeConfig};
 use crate::error::{Error, Result};
 
 /// No head has more blocks; the names of their tensors are written out.
@@ -29,7 +29,7 @@ impl HeadConfig {
     /// # Errors
     /// [`Error::Checkpoint`] with everything that is missing, of the wrong type or contradictory.
     pub fn from_json(text: &str) -> Result<Self> {
-        let config = WholeConfig::parse(text)?;
+        let config = CheckpointConfig::parse(text)?;
         let mut reader = Reader { problems: Vec::new() };
         let version = reader.version(&config);
         let head = reader.head(version, config.head());
@@ -61,7 +61,7 @@ struct Reader {
 
 impl Reader {
     /// The version that `model_type` names, or else the one that the keys of the head belong to.
-    fn version(&mut self, config: &WholeConfig) -> Version {
+    fn version(&mut self, config: &CheckpointConfig) -> Version {
         let declared = config.declared();
         if let Some(first) = declared.first() {
             if let Some(other) = declared.iter().find(|other| other.version != first.version) {
@@ -170,7 +170,7 @@ impl Reader {
             add_pos_embed: self.flag(head, "", "add_pos_embed", Some(true)),
         };
         if self.problems.is_empty() {
-            self.problems = disagreements(version, &config, head, dit);
+            self.problems = contradictions(version, &config, head, dit);
         }
         config
     }

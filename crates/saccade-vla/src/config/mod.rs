@@ -1,12 +1,12 @@
 //! The configuration of an action head.
 
-mod agreement;
+mod checkpoint_config;
+mod consistency;
 mod head_config;
 mod json;
 mod versions;
-mod whole;
 
+pub(crate) use checkpoint_config::{CheckpointConfig, HEAD_KEY, OWN_KEY, Object};
 pub use head_config::HeadConfig;
 pub(crate) use head_config::Reads;
 pub(crate) use versions::{Feature, Version};
-pub(crate) use whole::{HEAD_KEY, OWN_KEY, Object, WholeConfig};

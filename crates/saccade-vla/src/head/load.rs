@@ -17,7 +17,7 @@ use crate::nn::source::file::FileSource;
 use crate::nn::source::memory::{self, MemorySource, TensorViews};
 use crate::nn::weights::{Builder, Source};
 use crate::precision::Precision;
-use crate::recognise::Published;
+use crate::recognise::HeadCheckpoint;
 
 /// How a head is loaded.
 ///
@@ -115,7 +115,7 @@ impl ActionHead {
     /// fit each other (all that does not fit is listed); [`Error::Input`] for options out of range; [`Error::Memory`].
     pub fn load(source: &Path, options: &LoadOptions) -> Result<Self> {
         let engine = Engine::new(options.precision, options.num_threads)?;
-        let mut published = Published::open(source, options.config.as_deref())?;
+        let mut published = HeadCheckpoint::open(source, options.config.as_deref())?;
         published.config = options.rows_of(published.config)?;
         let embodiment_ids = chosen_embodiments(
             options.embodiment_ids.as_deref(),
@@ -128,7 +128,7 @@ impl ActionHead {
             published.nbytes(options.precision, embodiment_ids.len())?,
         )?;
         let drops_states = reads_state_dropout(&published.config_json, published.has(STATE_DROPOUT))?;
-        let Published {
+        let HeadCheckpoint {
             checkpoint,
             prefix,
             config,

@@ -4,6 +4,7 @@ mod action_encoder;
 pub(crate) mod action_head;
 mod cache;
 mod check;
+mod checkpoint;
 pub(crate) mod context;
 mod dit;
 mod embodiment_layers;
@@ -12,7 +13,6 @@ pub(crate) mod encode;
 mod layers;
 pub(crate) mod load;
 pub(crate) mod plan;
-mod published;
 pub(crate) mod sample;
 pub(crate) mod state_dropout;
 #[cfg(test)]

@@ -6,7 +6,7 @@
 use serde_json::Value;
 
 use crate::alloc::sized;
-use crate::config::WholeConfig;
+use crate::config::CheckpointConfig;
 use crate::error::{Error, Result};
 use crate::nn::weights::Weights;
 use saccade_vla_kernels::Activations;
@@ -31,7 +31,7 @@ pub(crate) struct StateDropout {
 /// # Errors
 /// [`Error::Checkpoint`] if the config says that states are set to zero and there is no tensor that says which.
 pub(super) fn reads_state_dropout(config: &str, is_there: bool) -> Result<bool> {
-    let config = WholeConfig::parse(config)?;
+    let config = CheckpointConfig::parse(config)?;
     let Some(given) = config.get(CONFIG_KEY) else {
         return Ok(is_there);
     };

@@ -15,7 +15,7 @@ use crate::array::Array;
 use crate::inspect::changes::Changes;
 use crate::inspect::trace::Recorded;
 use crate::precision::Precision;
-use crate::recognise::Published;
+use crate::recognise::HeadCheckpoint;
 use crate::sampling::timestep_embedding::action_encoder_embedding;
 
 /// A released head, with the config in the file's metadata.
@@ -226,7 +226,7 @@ fn the_size_is_known_before_loading() {
             .join("../../tests/data")
             .join(name);
         let config = config_of(&path);
-        let published = Published::open(&path, Some(&config)).unwrap();
+        let published = HeadCheckpoint::open(&path, Some(&config)).unwrap();
         for precision in [Precision::Float32, Precision::Bfloat16, Precision::Int8] {
             for ids in [vec![1], vec![0, 2]] {
                 let options = LoadOptions::default()

@@ -10,9 +10,9 @@ use super::options::overrides;
 use super::settings::{PATCH_SIZE, Preprocessing, ProcessorOptions};
 use super::tokenizer::TokenizerFiles;
 use super::{Processor, Tokenizer};
-use crate::config::{Version, WholeConfig};
+use crate::config::{CheckpointConfig, Version};
 use crate::error::{Error, Result, show_shape};
-use crate::recognise::Published;
+use crate::recognise::HeadCheckpoint;
 
 /// What the names of a backbone's tensors begin with: lerobot's, NVIDIA's, a backbone alone.
 const PREFIXES: [&str; 3] = ["_groot_model.backbone.", "backbone.", ""];
@@ -24,7 +24,7 @@ const MARKS: [(Version, &str); 3] = [
     (Version::N17, "model.model.visual."),
 ];
 
-/// Published repositories that have the tokenizer of a version, the released one first, and the files that are needed of it.
+/// HeadCheckpoint repositories that have the tokenizer of a version, the released one first, and the files that are needed of it.
 const PUBLISHED: [(Version, &[&str], &[&str]); 3] = [
     (
         Version::N15,
@@ -78,7 +78,7 @@ impl ProcessorSource {
         };
         let config = match read_object("config", &directory.join("config.json"))? {
             None => None,
-            Some(config) => Some(WholeConfig::parse(&Value::Object(config).to_string())?),
+            Some(config) => Some(CheckpointConfig::parse(&Value::Object(config).to_string())?),
         };
         let found = backbone_of(&checkpoint);
         let version = match found {
@@ -122,7 +122,7 @@ impl ProcessorSource {
         self.tokenizer.as_ref()
     }
 
-    /// Published repositories that have the tokenizer of this version, the released one first.
+    /// HeadCheckpoint repositories that have the tokenizer of this version, the released one first.
     #[must_use]
     pub fn published(&self) -> &'static [&'static str] {
         self.release().0
@@ -195,7 +195,7 @@ fn backbone_of(checkpoint: &Checkpoint) -> Option<(Version, &'static str)> {
 
 /// The version of a checkpoint without a backbone that is known.
 fn version_of_head(source: &Path) -> Result<Version> {
-    let head = Published::open(source, None)?;
+    let head = HeadCheckpoint::open(source, None)?;
     Version::named(&head.config.version).ok_or_else(|| {
         Error::Checkpoint(format!(
             "source: expected the backbone of GR00T N1.5, N1.6 or N1.7, got a head of {}",
@@ -205,7 +205,7 @@ fn version_of_head(source: &Path) -> Result<Version> {
 }
 
 /// That the config names no other version than the tensors.
-fn check_declared(config: &WholeConfig, version: Version) -> Result<()> {
+fn check_declared(config: &CheckpointConfig, version: Version) -> Result<()> {
     for declared in config.declared() {
         if declared.version.is_some_and(|other| other != version) {
             return Err(Error::Checkpoint(format!(
@@ -222,7 +222,7 @@ fn check_declared(config: &WholeConfig, version: Version) -> Result<()> {
 fn n15_sizes(
     checkpoint: &Checkpoint,
     prefix: &str,
-    config: Option<&WholeConfig>,
+    config: Option<&CheckpointConfig>,
 ) -> Result<(Option<usize>, Option<usize>)> {
     let shape = |name: &str| {
         let name = format!("{prefix}eagle_model.{name}");
@@ -268,7 +268,7 @@ fn n15_sizes(
 }
 
 /// The image size in a config of NVIDIA's layout.
-fn given_image_size(config: &WholeConfig) -> Option<u64> {
+fn given_image_size(config: &CheckpointConfig) -> Option<u64> {
     let eagle = config.top().get("backbone_cfg")?.get("eagle_config")?;
     let forced = eagle.get("force_image_size").and_then(Value::as_u64);
     forced.or_else(|| eagle.get("vision_config")?.get("image_size")?.as_u64())

@@ -2,7 +2,7 @@
 
 use serde_json::Value;
 
-use super::layout::{CheckpointLayout, Clues, Evidence};
+use super::layout::{CheckpointLayout, Contents, Evidence};
 use super::sizes::{DECODERS, FUTURE_TOKENS};
 use crate::config::{Feature, Version};
 use crate::error::{Error, Result};
@@ -12,10 +12,10 @@ use crate::error::{Error, Result};
 /// # Errors
 /// [`Error::Checkpoint`] for evidence that contradicts itself, and for names of GR00T models that are unknown.
 pub(super) fn recognise_version(
-    clues: &Clues<'_>,
+    contents: &Contents<'_>,
     layout: &dyn CheckpointLayout,
 ) -> Result<(Version, Vec<String>)> {
-    let found = evidence(clues, layout)?;
+    let found = evidence(contents, layout)?;
     let fits = |version: &Version| found.iter().all(|one| one.versions.contains(version));
     let possible: Vec<Version> = Version::all().filter(fits).collect();
     let sentences = found.iter().map(|one| {
@@ -34,15 +34,15 @@ pub(super) fn recognise_version(
         // Nothing says which: a head alone, whose config names no model.
         _ => *possible
             .iter()
-            .find(|version| **version == usual_version(clues))
+            .find(|version| **version == usual_version(contents))
             .unwrap_or(&possible[0]),
     };
     Ok((version, sentences.collect()))
 }
 
 /// The version that a head of these keys and tensors usually has.
-fn usual_version(clues: &Clues<'_>) -> Version {
-    let (config, tensors) = (clues.config, &clues.tensors);
+fn usual_version(contents: &Contents<'_>) -> Version {
+    let (config, tensors) = (contents.config, &contents.tensors);
     let is_flat = config.get("max_action_dim").is_some() && config.get("action_dim").is_none();
     match (
         is_flat || config.is_true("use_alternate_vl_dit"),
@@ -51,17 +51,17 @@ fn usual_version(clues: &Clues<'_>) -> Version {
         (true, true) => Version::N17,
         (true, false) => Version::N16,
         // lerobot's: every N1.5 that it can read has future tokens, which say so.
-        (false, _) if !clues.has_head_config => Version::N17,
+        (false, _) if !contents.has_head_config => Version::N17,
         (false, _) if config.get("use_vlln").is_none() && !tensors.any("vlln.") => Version::N1,
         (false, _) => Version::N15,
     }
 }
 
 /// Everything that says something about the version.
-fn evidence(clues: &Clues<'_>, layout: &dyn CheckpointLayout) -> Result<Vec<Evidence>> {
-    let (config, tensors) = (clues.config, &clues.tensors);
-    let mut found = names_of_models(clues)?;
-    layout.add_evidence(clues, &mut found);
+fn evidence(contents: &Contents<'_>, layout: &dyn CheckpointLayout) -> Result<Vec<Evidence>> {
+    let (config, tensors) = (contents.config, &contents.tensors);
+    let mut found = names_of_models(contents)?;
+    layout.add_evidence(contents, &mut found);
     let mut add = |feature, what| {
         found.push(Evidence {
             versions: Version::with(feature),
@@ -113,7 +113,7 @@ fn evidence(clues: &Clues<'_>, layout: &dyn CheckpointLayout) -> Result<Vec<Evid
 }
 
 /// The versions that the config names: as the type of a model, or as its class.
-fn names_of_models(clues: &Clues<'_>) -> Result<Vec<Evidence>> {
+fn names_of_models(contents: &Contents<'_>) -> Result<Vec<Evidence>> {
     let unknown = |what: &str| {
         let names = Version::model_types();
         Err(Error::Checkpoint(format!(
@@ -121,7 +121,7 @@ fn names_of_models(clues: &Clues<'_>) -> Result<Vec<Evidence>> {
         )))
     };
     let mut found = Vec::new();
-    for declared in clues.config.declared() {
+    for declared in contents.config.declared() {
         match declared.version {
             Some(version) => found.push(Evidence {
                 versions: vec![version],
@@ -130,7 +130,7 @@ fn names_of_models(clues: &Clues<'_>) -> Result<Vec<Evidence>> {
             None => return unknown(&declared.text),
         }
     }
-    if let Some(Value::Array(classes)) = clues.config.top().get("architectures") {
+    if let Some(Value::Array(classes)) = contents.config.top().get("architectures") {
         for class in classes {
             let what = format!("architectures names {class}");
             match class.as_str().map(Version::of_model) {

@@ -3,12 +3,12 @@
 use std::path::Path;
 
 use super::sizes::{self, HeadShapes};
-use crate::config::{Object, Version, WholeConfig};
+use crate::config::{CheckpointConfig, Object, Version};
 use crate::error::Result;
 
 /// What is known about a checkpoint before its version is recognised.
-pub(super) struct Clues<'a> {
-    pub config: &'a WholeConfig,
+pub(super) struct Contents<'a> {
+    pub config: &'a CheckpointConfig,
     /// Whether the config holds the head's.
     pub has_head_config: bool,
     pub tensors: HeadShapes<'a>,
@@ -24,31 +24,35 @@ pub(super) struct Evidence {
 
 /// How one program writes checkpoints.
 pub(super) trait CheckpointLayout: Sync {
-    /// Its name in [`Published::layout`](super::Published::layout).
+    /// Its name in [`HeadCheckpoint::layout`](super::HeadCheckpoint::layout).
     fn name(&self) -> &'static str;
 
     /// What the names of the head's tensors begin with, if it is always the same.
     fn prefix(&self) -> Option<&'static str>;
 
     /// Whether a checkpoint is written so.
-    fn matches(&self, clues: &Clues<'_>) -> bool;
+    fn matches(&self, contents: &Contents<'_>) -> bool;
 
     /// Whether a config is written so and holds no head, whose sizes must then come from elsewhere.
     ///
     /// # Errors
     /// [`Error::Checkpoint`](crate::Error::Checkpoint) for a config of another kind of policy.
-    fn is_without_head(&self, _config: &WholeConfig) -> Result<bool> {
+    fn is_without_head(&self, _config: &CheckpointConfig) -> Result<bool> {
         Ok(false)
     }
 
     /// Adds what the layout says about the version.
-    fn add_evidence(&self, _clues: &Clues<'_>, _found: &mut Vec<Evidence>) {}
+    fn add_evidence(&self, _clues: &Contents<'_>, _found: &mut Vec<Evidence>) {}
 
     /// The head's config in the released keys, and everything that it and the tensors disagree on.
     ///
     /// # Errors
     /// [`Error::Checkpoint`](crate::Error::Checkpoint) if there is no head's config, and the tensors do not make one.
-    fn head_config(&self, clues: &Clues<'_>, version: Version) -> Result<(Object, Vec<String>)> {
-        Ok(sizes::complete(clues.config.head(), version, &clues.tensors))
+    fn head_config(&self, contents: &Contents<'_>, version: Version) -> Result<(Object, Vec<String>)> {
+        Ok(sizes::complete(
+            contents.config.head(),
+            version,
+            &contents.tensors,
+        ))
     }
 }

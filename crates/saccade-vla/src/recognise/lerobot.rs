@@ -6,9 +6,9 @@ use std::path::Path;
 use saccade_vla_checkpoint::{OWN_CONFIG, read_text};
 use serde_json::{Map, Value, json};
 
-use super::layout::{CheckpointLayout, Clues, Evidence};
+use super::layout::{CheckpointLayout, Contents, Evidence};
 use super::sizes::{self, BLOCKS, FUTURE_TOKENS, HeadShapes, add_decoders, proved};
-use crate::config::{Feature, OWN_KEY, Object, Version, WholeConfig};
+use crate::config::{CheckpointConfig, Feature, OWN_KEY, Object, Version};
 use crate::error::{Error, Result};
 
 /// lerobot's: everything under `_groot_model.`, the policy's `config.json`.
@@ -34,11 +34,11 @@ impl CheckpointLayout for Lerobot {
         Some(PREFIX)
     }
 
-    fn matches(&self, clues: &Clues<'_>) -> bool {
-        clues.tensors.prefix == PREFIX || clues.config.top().contains_key("type")
+    fn matches(&self, contents: &Contents<'_>) -> bool {
+        contents.tensors.prefix == PREFIX || contents.config.top().contains_key("type")
     }
 
-    fn is_without_head(&self, config: &WholeConfig) -> Result<bool> {
+    fn is_without_head(&self, config: &CheckpointConfig) -> Result<bool> {
         match config.top().get("type") {
             _ if config.is_nested() => Ok(false),
             None => Ok(false),
@@ -49,15 +49,15 @@ impl CheckpointLayout for Lerobot {
         }
     }
 
-    fn add_evidence(&self, clues: &Clues<'_>, found: &mut Vec<Evidence>) {
-        if clues.has_head_config {
+    fn add_evidence(&self, contents: &Contents<'_>, found: &mut Vec<Evidence>) {
+        if contents.has_head_config {
             return;
         }
         found.push(Evidence {
             versions: VERSIONS.to_vec(),
             what: format!("config.json is lerobot's, type \"{POLICY}\""),
         });
-        if let Some(Value::String(base)) = clues.config.top().get("base_model_path")
+        if let Some(Value::String(base)) = contents.config.top().get("base_model_path")
             && let Some(version) = Version::in_path(base)
         {
             found.push(Evidence {
@@ -67,12 +67,16 @@ impl CheckpointLayout for Lerobot {
         }
     }
 
-    fn head_config(&self, clues: &Clues<'_>, version: Version) -> Result<(Object, Vec<String>)> {
-        if clues.has_head_config {
-            return Ok(sizes::complete(clues.config.head(), version, &clues.tensors));
+    fn head_config(&self, contents: &Contents<'_>, version: Version) -> Result<(Object, Vec<String>)> {
+        if contents.has_head_config {
+            return Ok(sizes::complete(
+                contents.config.head(),
+                version,
+                &contents.tensors,
+            ));
         }
-        let mut head = from_tensors(clues.config.top(), version, &clues.tensors)?;
-        if let Some(own) = own_config(clues.directory)? {
+        let mut head = from_tensors(contents.config.top(), version, &contents.tensors)?;
+        if let Some(own) = own_config(contents.directory)? {
             head.insert(OWN_KEY.to_owned(), own);
         }
         Ok((head, Vec::new()))
@@ -88,16 +92,16 @@ impl CheckpointLayout for Fork {
         Lerobot.prefix()
     }
 
-    fn matches(&self, clues: &Clues<'_>) -> bool {
-        clues.tensors.has_several_decoders()
+    fn matches(&self, contents: &Contents<'_>) -> bool {
+        contents.tensors.has_several_decoders()
     }
 
-    fn add_evidence(&self, clues: &Clues<'_>, found: &mut Vec<Evidence>) {
-        Lerobot.add_evidence(clues, found);
+    fn add_evidence(&self, contents: &Contents<'_>, found: &mut Vec<Evidence>) {
+        Lerobot.add_evidence(contents, found);
     }
 
-    fn head_config(&self, clues: &Clues<'_>, version: Version) -> Result<(Object, Vec<String>)> {
-        Lerobot.head_config(clues, version)
+    fn head_config(&self, contents: &Contents<'_>, version: Version) -> Result<(Object, Vec<String>)> {
+        Lerobot.head_config(contents, version)
     }
 }
 

@@ -4,9 +4,7 @@
 //! shapes of the tensors. Where config and tensors disagree, one error lists everything.
 
 mod evidence;
-pub(crate) mod kept;
 mod layout;
-mod layouts;
 mod lerobot;
 mod nvidia;
 pub(crate) mod sizes;
@@ -16,16 +14,16 @@ use std::path::Path;
 use saccade_vla_checkpoint::{Checkpoint, read_text};
 use serde_json::Value;
 
-use crate::config::{HeadConfig, WholeConfig};
+use crate::config::{CheckpointConfig, HeadConfig};
 use crate::error::{Error, Result};
 use evidence::recognise_version;
-use kept::kept_embodiments;
-use layout::Clues;
-use layouts::{has_head_config, head_prefix, layout_of};
+use layout::{CheckpointLayout, Contents};
+use lerobot::{Fork, Lerobot};
+use nvidia::{IsaacFineTune, Nvidia, Own};
 use sizes::HeadShapes;
 
 /// A checkpoint, open, and what it is.
-pub struct Published {
+pub struct HeadCheckpoint {
     /// Its tensors.
     pub checkpoint: Checkpoint,
     /// What the names of the head's tensors begin with.
@@ -43,7 +41,7 @@ pub struct Published {
     pub evidence: Vec<String>,
 }
 
-impl Published {
+impl HeadCheckpoint {
     /// Opens `source`, one `.safetensors` file or a directory of them, with `config`, as JSON, or the `config.json` next to the weights.
     ///
     /// The names and shapes of single tensors are checked where they are read.
@@ -67,11 +65,11 @@ impl Published {
             None => read_text("config", &path)?,
         };
         let prefix = head_prefix(&checkpoint)?;
-        let config = WholeConfig::parse(&given_config).map_err(|error| match config {
+        let config = CheckpointConfig::parse(&given_config).map_err(|error| match config {
             Some(_) => error,
             None => error.in_file(&path),
         })?;
-        let clues = Clues {
+        let contents = Contents {
             has_head_config: has_head_config(&config)?,
             config: &config,
             tensors: HeadShapes {
@@ -80,9 +78,9 @@ impl Published {
             },
             directory,
         };
-        let layout = layout_of(&clues);
-        let (version, evidence) = recognise_version(&clues, layout)?;
-        let (head, problems) = layout.head_config(&clues, version)?;
+        let layout = layout_of(&contents);
+        let (version, evidence) = recognise_version(&contents, layout)?;
+        let (head, problems) = layout.head_config(&contents, version)?;
         let config_json = Value::Object(head).to_string();
         // What is wrong with the config alone comes first.
         let head = HeadConfig::from_json(&config_json)?;
@@ -104,7 +102,7 @@ impl Published {
         })
     }
 
-    /// All tensors of the checkpoint, sorted by name; without those that are in two files, which [`Published::check`] refuses in a head.
+    /// All tensors of the checkpoint, sorted by name; without those that are in two files, which [`HeadCheckpoint::check`] refuses in a head.
     pub fn tensors(&self) -> impl Iterator<Item = TensorFacts> {
         let checkpoint = &self.checkpoint;
         checkpoint.names().filter_map(|name| {
@@ -142,4 +140,78 @@ pub struct TensorFacts {
     pub shape: Vec<usize>,
     /// Its bytes in the file.
     pub nbytes: u64,
+}
+
+/// Every layout. The first one that a checkpoint has is its own; the last one fits all.
+static LAYOUTS: [&dyn CheckpointLayout; 5] = [&Fork, &Lerobot, &Own, &IsaacFineTune, &Nvidia];
+
+/// The layout of a checkpoint.
+fn layout_of(contents: &Contents<'_>) -> &'static dyn CheckpointLayout {
+    let [.., last] = LAYOUTS;
+    let found = LAYOUTS.into_iter().find(|layout| layout.matches(contents));
+    found.unwrap_or(last)
+}
+
+/// Whether a config holds a head's.
+///
+/// # Errors
+/// [`Error::Checkpoint`] for a config of another kind of policy.
+fn has_head_config(config: &CheckpointConfig) -> Result<bool> {
+    for layout in LAYOUTS {
+        if layout.is_without_head(config)? {
+            return Ok(false);
+        }
+    }
+    Ok(true)
+}
+
+/// What the names of the tensors of a backbone begin with, in the layouts that name them so.
+const BACKBONES: [&str; 2] = ["backbone.", "_groot_model.backbone."];
+
+/// What the names of the head's tensors begin with: empty if no layout's prefix is used.
+///
+/// # Errors
+/// [`Error::Checkpoint`] if there are two heads in one checkpoint, or a backbone alone.
+fn head_prefix(checkpoint: &Checkpoint) -> Result<&'static str> {
+    let mut used: Vec<&str> = Vec::new();
+    for prefix in LAYOUTS.iter().filter_map(|layout| layout.prefix()) {
+        if !used.contains(&prefix) && checkpoint.names().any(|name| name.starts_with(prefix)) {
+            used.push(prefix);
+        }
+    }
+    match used[..] {
+        [] => {
+            let is_backbone = |name: &str| BACKBONES.iter().any(|prefix| name.starts_with(prefix));
+            match checkpoint.names().next() {
+                Some(first) if checkpoint.names().all(is_backbone) => Err(Error::Checkpoint(format!(
+                    "source: there is no action head among the {} tensors, such as {first}: this is a backbone alone",
+                    checkpoint.names().count()
+                ))),
+                _ => Ok(""),
+            }
+        }
+        [prefix] => Ok(prefix),
+        [first, second, ..] => Err(Error::Checkpoint(format!(
+            "source: two heads in one checkpoint, under `{first}` and `{second}`"
+        ))),
+    }
+}
+
+/// The metadata key of the embodiments that were kept when others were removed.
+pub(crate) const KEPT_EMBODIMENTS: &str = "saccade_embodiment_ids";
+
+/// The embodiments whose layers were kept when others were removed; none if all are there.
+///
+/// # Errors
+/// [`Error::Checkpoint`] if the files' metadata list anything but numbers.
+pub(crate) fn kept_embodiments(checkpoint: &Checkpoint) -> Result<Option<Vec<i64>>> {
+    let Some(listed) = checkpoint.metadata().get(KEPT_EMBODIMENTS) else {
+        return Ok(None);
+    };
+    let ids: std::result::Result<_, _> = listed.split(',').map(str::parse).collect();
+    ids.map(Some).map_err(|_| {
+        Error::Checkpoint(format!(
+            "source: {KEPT_EMBODIMENTS} in the metadata is `{listed}`, expected numbers with commas between them"
+        ))
+    })
 }

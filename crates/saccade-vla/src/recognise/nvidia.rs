@@ -1,6 +1,6 @@
 //! NVIDIA's checkpoints, as published and as Isaac-GR00T's trainer writes them, and heads alone, as saccade writes them.
 
-use super::layout::{CheckpointLayout, Clues};
+use super::layout::{CheckpointLayout, Contents};
 
 /// NVIDIA's: `action_head.*` and `backbone.*`.
 pub(super) struct Nvidia;
@@ -25,8 +25,8 @@ impl CheckpointLayout for Nvidia {
         Some(PREFIX)
     }
 
-    fn matches(&self, clues: &Clues<'_>) -> bool {
-        !Own.matches(clues)
+    fn matches(&self, contents: &Contents<'_>) -> bool {
+        !Own.matches(contents)
     }
 }
 
@@ -39,8 +39,8 @@ impl CheckpointLayout for IsaacFineTune {
         Some(PREFIX)
     }
 
-    fn matches(&self, clues: &Clues<'_>) -> bool {
-        Nvidia.matches(clues) && clues.directory.join("trainer_state.json").is_file()
+    fn matches(&self, contents: &Contents<'_>) -> bool {
+        Nvidia.matches(contents) && contents.directory.join("trainer_state.json").is_file()
     }
 }
 
@@ -53,8 +53,8 @@ impl CheckpointLayout for Own {
         None
     }
 
-    fn matches(&self, clues: &Clues<'_>) -> bool {
-        let top = clues.config.top();
+    fn matches(&self, contents: &Contents<'_>) -> bool {
+        let top = contents.config.top();
         !BACKBONE_KEYS.iter().any(|key| top.contains_key(*key))
     }
 }

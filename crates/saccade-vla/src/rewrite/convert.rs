@@ -12,7 +12,7 @@ use crate::head::embodiments::chosen_embodiments;
 use crate::head::plan::tensor_specs;
 use crate::head::state_dropout::STATE_DROPOUT;
 use crate::ops::check_interrupted;
-use crate::recognise::kept::{KEPT_EMBODIMENTS, kept_embodiments};
+use crate::recognise::{KEPT_EMBODIMENTS, kept_embodiments};
 use crate::rewrite::adapter::{Adapter, Delta};
 use crate::rewrite::float::Float;
 use crate::rewrite::{RewriteOptions, SourceCheckpoint, Written};

@@ -8,7 +8,7 @@ use saccade_vla_checkpoint::{Checkpoint, CheckpointWriter, Dtype, PlannedTensor,
 use saccade_vla_kernels::quantize_rows;
 
 use crate::alloc::filled;
-use crate::backbone::PublishedBackbone;
+use crate::backbone::BackboneCheckpoint;
 use crate::error::{Error, Result};
 use crate::head::plan::tensor_specs;
 use crate::nn::weights::weight_view;
@@ -61,7 +61,7 @@ pub fn quantize(
     let backbone = backbone_of(&source, options)?;
     let head_specs = tensor_specs(&source.config)?;
     let of_backbone = backbone.as_ref().ok().and_then(Option::as_ref);
-    let backbone_prefix = of_backbone.map(PublishedBackbone::prefix);
+    let backbone_prefix = of_backbone.map(BackboneCheckpoint::prefix);
     let mut weights = Names::default();
     weights.add(source.prefix, &head_specs);
     if let Some(backbone) = of_backbone {
@@ -154,7 +154,7 @@ impl Names {
 fn backbone_of(
     source: &SourceCheckpoint,
     options: &RewriteOptions,
-) -> Result<std::result::Result<Option<PublishedBackbone>, String>> {
+) -> Result<std::result::Result<Option<BackboneCheckpoint>, String>> {
     let has_others = source.checkpoint.names().any(|name| !source.is_head(name));
     if options.head_only || !has_others {
         return Ok(Ok(None));
@@ -162,7 +162,7 @@ fn backbone_of(
     if options.keep_backbone {
         return Ok(Err("as requested".to_owned()));
     }
-    match PublishedBackbone::open(&source.path, Some(&source.given_config)) {
+    match BackboneCheckpoint::open(&source.path, Some(&source.given_config)) {
         Ok(backbone) => Ok(Ok(Some(backbone))),
         // Not a backbone that saccade loads, such as one of a program's own.
         Err(Error::Checkpoint(why)) => Ok(Err(why)),

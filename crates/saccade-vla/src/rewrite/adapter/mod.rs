@@ -15,7 +15,7 @@ use saccade_vla_checkpoint::{
 use serde_json::value::RawValue;
 
 use crate::error::{Error, Result};
-use crate::recognise::Published;
+use crate::recognise::HeadCheckpoint;
 use crate::rewrite::float::Float;
 use crate::rewrite::json_edit::{find, span};
 use config::{AdapterConfig, Names, is_end};
@@ -47,10 +47,10 @@ pub(crate) struct Adapter {
 /// `config.json`, if it has one, takes the place of the base's, as in lerobot.
 ///
 /// # Errors
-/// As [`Published::open`].
-pub fn open_base(source: &Path, config: Option<&str>, adapter: Option<&Path>) -> Result<Published> {
+/// As [`HeadCheckpoint::open`].
+pub fn open_base(source: &Path, config: Option<&str>, adapter: Option<&Path>) -> Result<HeadCheckpoint> {
     let Some(adapter) = adapter else {
-        return Published::open(source, config);
+        return HeadCheckpoint::open(source, config);
     };
     let own = match config {
         Some(_) => None,
@@ -60,7 +60,7 @@ pub fn open_base(source: &Path, config: Option<&str>, adapter: Option<&Path>) ->
         true => Checkpoint::open_beside_adapter(source)?,
         false => Checkpoint::open(source)?,
     };
-    Published::of(checkpoint, source, config.or(own.as_deref()))
+    HeadCheckpoint::of(checkpoint, source, config.or(own.as_deref()))
 }
 
 /// Whether the adapter is in the directory of its base.

@@ -7,20 +7,20 @@ use saccade_vla_checkpoint::{Checkpoint, TensorSpec, read_text};
 use super::config::BackboneConfig;
 use super::json::GivenConfig;
 use super::plan::{nbytes, plan};
-use super::recognise::Found;
+use super::recognise::Recognised;
 use crate::engine::Engine;
 use crate::error::{Error, Result};
 use crate::nn::source::planner::Plan;
 use crate::precision::Precision;
 
 /// A checkpoint with a backbone, open, whose tensors fit its config.
-pub struct PublishedBackbone {
+pub struct BackboneCheckpoint {
     pub(super) checkpoint: Checkpoint,
-    pub(super) found: Found,
+    pub(super) found: Recognised,
     pub(super) plan: Plan,
 }
 
-impl PublishedBackbone {
+impl BackboneCheckpoint {
     /// Opens `source`, one `.safetensors` file or a directory of them, with `config`, as JSON, or the `config.json` next to the weights, if
     /// there is one. Reads no tensor.
     ///
@@ -34,7 +34,7 @@ impl PublishedBackbone {
             None => config_of(source)?,
         };
         let names: Vec<&str> = checkpoint.names().collect();
-        let found = Found::new(names.iter().copied(), &given)?;
+        let found = Recognised::new(names.iter().copied(), &given)?;
         let plan = plan(&found)?;
         let is_unused = |name: &str, _: &[usize]| found.is_unused(name);
         let problems = checkpoint.problems(found.prefix, &plan.specs, is_unused);

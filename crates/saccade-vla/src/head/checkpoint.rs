@@ -10,9 +10,9 @@ use crate::error::{Error, Result};
 use crate::nn::source::sizer::Sizer;
 use crate::nn::weights::Builder;
 use crate::precision::Precision;
-use crate::recognise::Published;
+use crate::recognise::HeadCheckpoint;
 
-impl Published {
+impl HeadCheckpoint {
     /// Checks that exactly the head's tensors are under the prefix, each of the right shape and a readable type. Tensors that only training
     /// uses may be there too.
     ///

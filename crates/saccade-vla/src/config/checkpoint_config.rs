@@ -15,7 +15,7 @@ pub(crate) const HEAD_KEY: &str = "action_head_cfg";
 pub(crate) const OWN_KEY: &str = "saccade";
 
 /// The text of a config, read.
-pub(crate) struct WholeConfig {
+pub(crate) struct CheckpointConfig {
     top: Object,
     /// The head's, where the whole one has it under a key of its own.
     nested: Option<Object>,
@@ -29,7 +29,7 @@ pub(crate) struct Declared {
     pub version: Option<Version>,
 }
 
-impl WholeConfig {
+impl CheckpointConfig {
     /// # Errors
     /// [`Error::Json`] for text that is not JSON; [`Error::Checkpoint`] if it is no object, and if the head's config in it is none or has saccade's key next to it.
     pub(crate) fn parse(text: &str) -> Result<Self> {

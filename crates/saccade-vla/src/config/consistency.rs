@@ -2,12 +2,12 @@
 
 use serde_json::Value;
 
+use super::checkpoint_config::Object;
 use super::head_config::{HeadConfig, MAX_SIZE};
 use super::versions::Version;
-use super::whole::Object;
 
 /// Everything in a head's config that contradicts itself. `head` and `dit` are the objects that it was read from.
-pub(super) fn disagreements(
+pub(super) fn contradictions(
     version: Version,
     config: &HeadConfig,
     head: &Object,

@@ -3,7 +3,7 @@
 use super::config::{BackboneConfig, Tower};
 
 /// Everything in which the sizes do not fit each other.
-pub(super) fn disagreements(config: &BackboneConfig) -> Vec<String> {
+pub(super) fn contradictions(config: &BackboneConfig) -> Vec<String> {
     let BackboneConfig { vision, language, .. } = config;
     let mut problems = Vec::new();
     let mut add = |is_wrong: bool, problem: String| {
