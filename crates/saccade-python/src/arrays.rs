@@ -6,7 +6,7 @@ use numpy::{
 };
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
-use saccade_vla::{Array, ArrayMut, ElementsRef, Error, OwnedArray, TensorView, TensorViews};
+use saccade_vla::{Array, ArrayMut, ElementsRef, Error, OwnedArray, Problem, TensorView, TensorViews};
 
 use crate::error::raise;
 
@@ -114,8 +114,10 @@ pub(crate) fn tensor_views<'a>(held: &'a [(String, PyTensor<'_>)]) -> PyResult<T
                     "bfloat16" => ElementsRef::Bf16(bits),
                     "float16" => ElementsRef::F16(bits),
                     _ => {
-                        return Err(raise(Error::Input(format!(
-                            "tensors: expected float32, bfloat16 or float16, got {dtype}"
+                        return Err(raise(Error::Input(Problem::expected(
+                            "tensors",
+                            "float32, bfloat16 or float16",
+                            dtype,
                         ))));
                     }
                 };

@@ -8,14 +8,16 @@ use pyo3::sync::PyOnceLock;
 use pyo3::types::PyType;
 use saccade_vla::{Error, ErrorKind};
 
-/// What Python users can do about an error of the core, by how its message begins. The core's own words are for every language.
-const HINTS: [(&str, &str); 2] = [
-    ("state: expected ", "saccade.Normalizer converts a robot's state"),
-    (
-        "attention_mask: expected no false entry",
-        "in Python: attention_mask=None, or drop_vl=~attention_mask",
-    ),
-];
+/// Advice for Python users about an error of the core, whose own words are for every language.
+fn hint(error: &Error) -> Option<&'static str> {
+    match (error.argument()?, error.kind()) {
+        ("state", ErrorKind::Shape | ErrorKind::Input) => Some("saccade.Normalizer converts a robot's state"),
+        ("attention_mask", ErrorKind::Input) => {
+            Some("in Python: attention_mask=None, or drop_vl=~attention_mask")
+        }
+        _ => None,
+    }
+}
 
 /// The exception of `saccade.errors` for an error of the core.
 pub(crate) fn raise(error: Error) -> PyErr {
@@ -23,7 +25,7 @@ pub(crate) fn raise(error: Error) -> PyErr {
     static INPUT: PyOnceLock<Py<PyType>> = PyOnceLock::new();
     static CHECKPOINT: PyOnceLock<Py<PyType>> = PyOnceLock::new();
     let mut message = error.to_string();
-    if let Some((_, hint)) = HINTS.iter().find(|(start, _)| message.starts_with(start)) {
+    if let Some(hint) = hint(&error) {
         message = format!("{message}; {hint}");
     }
     match error.kind() {

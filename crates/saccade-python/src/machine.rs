@@ -4,7 +4,7 @@ use pyo3::exceptions::PyMemoryError;
 use pyo3::prelude::*;
 use pyo3::types::{PyDict, PyTuple};
 use saccade_vla::peak::{self, PeakError};
-use saccade_vla::{Arithmetic, CpuReport, Error, Isa, Part, Profile, Profiling};
+use saccade_vla::{Arithmetic, CpuReport, Error, Isa, Part, Problem, Profile, Profiling};
 
 use crate::detached::call;
 use crate::error::raise;
@@ -14,9 +14,11 @@ use crate::error::raise;
 #[pyfunction]
 pub(crate) fn measure_peaks(py: Python<'_>, num_threads: usize) -> PyResult<Bound<'_, PyDict>> {
     if num_threads == 0 {
-        return Err(raise(Error::Input(
-            "num_threads: expected at least 1, got 0".to_owned(),
-        )));
+        return Err(raise(Error::Input(Problem::expected(
+            "num_threads",
+            "at least 1",
+            "0",
+        ))));
     }
     let mut isas = Isa::available();
     let selected = Isa::from_env().map_err(|error| raise(error.into()))?;
@@ -80,7 +82,7 @@ impl StayOnThisThread {
 fn peak_or_raise(measured: Result<f64, PeakError>) -> PyResult<f64> {
     measured.map_err(|error| match error {
         PeakError::Alloc(error) => PyMemoryError::new_err(error.to_string()),
-        error => raise(Error::Input(format!("num_threads: {error}"))),
+        error => raise(Error::Input(Problem::new("num_threads", error))),
     })
 }
 

@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use numpy::{PyArrayDyn, PyReadonlyArrayDyn, PyUntypedArrayMethods};
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
-use saccade_vla::{ConvertOptions, Error, ResizeOptions, RewriteOptions, Written};
+use saccade_vla::{ConvertOptions, Error, Problem, ResizeOptions, RewriteOptions, Written};
 
 use crate::arrays::to_numpy;
 use crate::detached::call;
@@ -157,9 +157,7 @@ pub(crate) fn merge_future_tokens<'py>(
 ) -> PyResult<PyMergedTokens<'py>> {
     let (rows, &[_, width]) = (tokens.as_slice()?, tokens.shape()) else {
         let axes = tokens.shape().len();
-        return Err(raise(Error::Shape(format!(
-            "tokens: expected two axes, got {axes}"
-        ))));
+        return Err(raise(Error::Shape(Problem::expected("tokens", "two axes", axes))));
     };
     let merged = call(py, || {
         saccade_vla::merge_future_tokens(rows, width, num_future_tokens, key_bias.as_deref())

@@ -6,6 +6,7 @@ use serde_json::{Map, Value};
 
 use crate::error::{Error, Result};
 use crate::names::is_processor;
+use crate::problem;
 use crate::source::read_text;
 
 /// The config of an adapter.
@@ -48,16 +49,14 @@ pub(crate) fn refuse_adapter(source: &Path) -> Result<()> {
     let adapter = Described::of(directory);
     let (shown, merge) = (directory.display(), adapter.merge(directory));
     Err(Error::Checkpoint(match weights {
-        None => format!(
-            "source: {shown} is {}, not a model: merge it into its base with `{merge}`",
-            adapter.what
+        None => problem!(
+            "source"; "{shown} is {}, not a model: merge it into its base with `{merge}`", adapter.what
         ),
-        Some(weights) => format!(
-            "source: {shown} holds a model ({}) and beside it {}: if the weights do not contain it yet, merge the two with `{merge}`; if they \
-             do, remove {}",
-            weights.file_name().unwrap_or_default().display(),
-            adapter.what,
-            found.join(", "),
+        Some(weights) => problem!(
+            "source";
+            "{shown} holds a model ({}) and beside it {}: if the weights do not contain it yet, merge the two \
+             with `{merge}`; if they do, remove {}",
+            weights.file_name().unwrap_or_default().display(), adapter.what, found.join(", ")
         ),
     }))
 }
@@ -71,13 +70,11 @@ pub(crate) fn refuse_use_peft(source: &Path) -> Result<()> {
         Some(_) => {}
     }
     let adapter = Described::of(directory);
-    Err(Error::Checkpoint(format!(
-        "source: {}: use_peft in config.json: lerobot takes this directory for {} and does not read the weights of a model in it: merge the two \
+    Err(Error::Checkpoint(problem!(
+        "source";
+        "{}: use_peft in config.json: lerobot takes this directory for {} and does not read the weights of a model in it: merge the two \
          with `{}`; if the weights are merged already, set use_peft to false and remove {}",
-        directory.display(),
-        adapter.what,
-        adapter.merge(directory),
-        FILES.join(", "),
+        directory.display(), adapter.what, adapter.merge(directory), FILES.join(", ")
     )))
 }
 

@@ -1,7 +1,7 @@
 //! What can go wrong with files, and how messages show shapes, sizes and text from strangers.
 
 use std::borrow::Cow;
-use std::fmt::Write;
+use std::fmt::{self, Display, Formatter, Write};
 use std::io;
 use std::path::{Path, PathBuf};
 
@@ -13,11 +13,11 @@ pub type Result<T> = std::result::Result<T, Error>;
 #[non_exhaustive]
 pub enum Error {
     /// An argument is out of range, or names a directory that must not be replaced.
-    #[error("{}", printable(.0))]
-    Input(String),
+    #[error("{0}")]
+    Input(Problem),
     /// A checkpoint is broken, incomplete or of another kind.
-    #[error("{}", printable(.0))]
-    Checkpoint(String),
+    #[error("{0}")]
+    Checkpoint(Problem),
     /// A file cannot be read.
     #[error("{what}: {} cannot be read: {source}", printable(&path.to_string_lossy()))]
     Unreadable {
@@ -46,7 +46,7 @@ pub enum Error {
         /// The file.
         path: PathBuf,
         /// Where and why.
-        source: serde_json::Error,
+        source: Box<dyn std::error::Error + Send + Sync>,
     },
     /// A file cannot be written.
     #[error("out: {} cannot be written: {source}", printable(&path.to_string_lossy()))]
@@ -92,6 +92,20 @@ pub enum Error {
 }
 
 impl Error {
+    /// The argument that is to blame, if one is.
+    #[must_use]
+    pub fn argument(&self) -> Option<&str> {
+        match self {
+            Self::Input(problem) | Self::Checkpoint(problem) => problem.argument(),
+            Self::Unreadable { what, .. }
+            | Self::Json { what, .. }
+            | Self::Memory { what, .. }
+            | Self::NotFound { what, .. } => Some(what),
+            Self::UnreadableTensor { .. } => Some("source"),
+            Self::Output { .. } | Self::Stranded { .. } => Some("out"),
+        }
+    }
+
     /// The error for `path`, which could not be opened or read.
     pub(crate) fn reading(what: &'static str, path: &Path, source: io::Error) -> Self {
         let path = path.to_owned();
@@ -107,6 +121,92 @@ impl Error {
             path: path.to_owned(),
             source,
         }
+    }
+}
+
+/// An argument, and why it is refused. Its text names the argument, what was expected and what was given.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Problem {
+    argument: String,
+    reason: Reason,
+}
+
+#[derive(Clone, Debug, PartialEq, Eq)]
+enum Reason {
+    Unexpected { expected: String, given: String },
+    Other(String),
+}
+
+impl Problem {
+    /// The problem `argument: expected ..., got ...`. The argument may be a path into one, as `chunking: overlap`.
+    pub fn expected(argument: impl Display, expected: impl Display, given: impl Display) -> Self {
+        let (expected, given) = (expected.to_string(), given.to_string());
+        Self {
+            argument: argument.to_string(),
+            reason: Reason::Unexpected { expected, given },
+        }
+    }
+
+    /// The problem `argument: text`, where the two sides do not say it.
+    pub fn new(argument: impl Display, text: impl Display) -> Self {
+        Self {
+            argument: argument.to_string(),
+            reason: Reason::Other(text.to_string()),
+        }
+    }
+
+    /// The argument, where one is to blame.
+    #[must_use]
+    pub fn argument(&self) -> Option<&str> {
+        Some(self.argument.as_str()).filter(|argument| !argument.is_empty())
+    }
+
+    /// What was expected and what was given, where the text says both.
+    #[must_use]
+    pub fn sides(&self) -> Option<(&str, &str)> {
+        match &self.reason {
+            Reason::Unexpected { expected, given } => Some((expected, given)),
+            Reason::Other(_) => None,
+        }
+    }
+}
+
+/// A [`Problem`] in the words of its place: `problem!("out"; "{path} exists")`, or with both sides,
+/// `problem!("num_heads"; expected "a divisor of {width}"; got "{num_heads}")`.
+#[doc(hidden)]
+#[macro_export]
+macro_rules! problem {
+    ($argument:expr; expected $expected:literal $(, $of:expr)*; got $given:literal $(, $with:expr)*) => {
+        $crate::Problem::expected(
+            $argument,
+            format_args!($expected $(, $of)*),
+            format_args!($given $(, $with)*),
+        )
+    };
+    ($argument:expr; $text:literal $(, $with:expr)*) => {
+        $crate::Problem::new($argument, format_args!($text $(, $with)*))
+    };
+}
+
+/// A problem of no argument.
+impl From<String> for Problem {
+    fn from(text: String) -> Self {
+        Self::new("", text)
+    }
+}
+
+impl Display for Problem {
+    fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
+        let mut text = match &self.reason {
+            Reason::Unexpected { expected, given } => format!("expected {expected}, got {given}"),
+            Reason::Other(text) => text.clone(),
+        };
+        if let Some(argument) = self.argument() {
+            // A list begins on a line of its own.
+            let space = if text.starts_with('\n') { "" } else { " " };
+            text = format!("{argument}:{space}{text}");
+        }
+        f.write_str(&printable(&text))
     }
 }
 
@@ -211,9 +311,10 @@ mod tests {
 
     #[test]
     fn messages_do_nothing_to_a_terminal() {
-        let error = Error::Checkpoint(
-            "source: 2 tensors:\n  a\u{1b}[2Jb is unknown\n  c\r\u{202e}d\u{9b}".to_owned(),
-        );
+        let error = Error::Checkpoint(Problem::new(
+            "source",
+            "2 tensors:\n  a\u{1b}[2Jb is unknown\n  c\r\u{202e}d\u{9b}",
+        ));
         let expected = "source: 2 tensors:\n  a\\u{1b}[2Jb is unknown\n  c\\u{d}\\u{202e}d\\u{9b}";
         assert_eq!(error.to_string(), expected);
         let error = Error::NotFound {
@@ -226,18 +327,43 @@ mod tests {
     #[test]
     fn long_messages_end() {
         let (begin, end) = ("a".repeat(MAX_LINE), "e".repeat(MAX_LINE));
-        let shown = Error::Input(format!("{begin}{}{end}", "m".repeat(10 * MAX_LINE))).to_string();
+        let shown = Error::Input(format!("{begin}{}{end}", "m".repeat(10 * MAX_LINE)).into()).to_string();
         assert_eq!(shown, format!("{begin}...{end}"));
         assert_eq!(
-            Error::Input(format!("{begin}{end}")).to_string(),
+            Error::Input(format!("{begin}{end}").into()).to_string(),
             format!("{begin}{end}")
         );
         let many = "a line\n".repeat(10 * MAX_LINES);
-        let shown = Error::Input(many.clone()).to_string();
+        let shown = Error::Input(many.clone().into()).to_string();
         assert_eq!(shown.lines().count(), MAX_LINES + 1);
         assert!(many.starts_with(shown.strip_suffix("  ...").unwrap()));
         let all = "a line with \"quotes\", tabs not, \u{e4}\u{3b1}\u{4e2d}\n".repeat(MAX_LINES);
-        assert_eq!(Error::Input(all.clone()).to_string(), all);
+        assert_eq!(Error::Input(all.clone().into()).to_string(), all);
+    }
+
+    #[test]
+    fn problems_say_what_they_are_about() {
+        let given = 3;
+        let problem = problem!("count"; expected "at most {}", 2; got "{given}");
+        assert_eq!(problem.to_string(), "count: expected at most 2, got 3");
+        assert_eq!(
+            (problem.argument(), problem.sides()),
+            (Some("count"), Some(("at most 2", "3")))
+        );
+        let problem = problem!("out"; "{given} is there");
+        assert_eq!(
+            (problem.to_string().as_str(), problem.sides()),
+            ("out: 3 is there", None)
+        );
+        assert_eq!(
+            problem!("options"; "\n  a\n  b").to_string(),
+            "options:\n  a\n  b"
+        );
+        let problem = Problem::from("stopped".to_owned());
+        assert_eq!(
+            (problem.to_string().as_str(), problem.argument()),
+            ("stopped", None)
+        );
     }
 
     #[test]

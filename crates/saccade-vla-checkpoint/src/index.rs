@@ -8,6 +8,7 @@ use crate::adapter::is_adapter;
 use crate::error::{Error, Result};
 use crate::names::is_processor;
 use crate::names::plain_name;
+use crate::problem;
 use crate::source::read_text;
 use crate::unique_map::UniqueMap;
 
@@ -25,7 +26,8 @@ impl WeightFiles {
     /// `model.safetensors` alone if it is there, as in transformers and lerobot; or else those that the directory's index
     /// (`*.safetensors.index.json`) names; or else all that are no processor's statistics.
     pub(crate) fn of(directory: &Path) -> Result<Self> {
-        let bad = |problem: String| Error::Checkpoint(format!("source: {}: {problem}", directory.display()));
+        let bad =
+            |problem: String| Error::Checkpoint(problem!("source"; "{}: {problem}", directory.display()));
         let all: Vec<OsString> = std::fs::read_dir(directory)
             .and_then(|entries| entries.map(|entry| Ok(entry?.file_name())).collect())
             .map_err(|error| Error::reading("source", directory, error))?;
@@ -71,12 +73,12 @@ impl WeightFiles {
         struct Index {
             weight_map: UniqueMap<String>,
         }
-        let bad = |problem: String| Error::Checkpoint(format!("source: {}: {problem}", path.display()));
+        let bad = |problem: String| Error::Checkpoint(problem!("source"; "{}: {problem}", path.display()));
         let text = read_text("source", path)?;
         let index: Index = serde_json::from_str(&text).map_err(|source| Error::Json {
             what: "source",
             path: path.to_owned(),
-            source,
+            source: source.into(),
         })?;
         let mut files = BTreeSet::new();
         let mut weight_map = Vec::new();

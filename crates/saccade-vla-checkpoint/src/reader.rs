@@ -11,12 +11,13 @@ use safetensors::tensor::TensorInfo;
 
 use crate::adapter::{refuse_adapter, refuse_use_peft};
 use crate::elements::{Elements, check_int8};
-use crate::error::{Error, Result, granted, reserve, show_shape};
+use crate::error::{Error, Problem, Result, granted, reserve, show_shape};
 use crate::header::Header;
 use crate::index::WeightFiles;
 use crate::names::plain_name;
+use crate::problem;
 use crate::source::SourceFile;
-use crate::spec::{self, Problem, SCALE_SUFFIX, TensorSpec};
+use crate::spec::{self, SCALE_SUFFIX, TensorProblem, TensorSpec};
 
 /// Bytes that are copied together.
 const PIECE: usize = 1 << 24;
@@ -130,14 +131,14 @@ impl Checkpoint {
         prefix: &str,
         expected: &[TensorSpec],
         is_unused: impl Fn(&str, &[usize]) -> bool,
-    ) -> Vec<Problem> {
+    ) -> Vec<TensorProblem> {
         let describe = |name: &str| self.describe(name);
         let mut problems = spec::problems(self.names(), describe, prefix, expected, is_unused);
         let twice = self
             .duplicates
             .iter()
             .filter(|(name, _)| name.starts_with(prefix));
-        problems.extend(twice.map(|(_, problem)| Problem::Other(problem.clone())));
+        problems.extend(twice.map(|(_, problem)| TensorProblem::Other(problem.clone())));
         problems
     }
 
@@ -197,9 +198,8 @@ impl Checkpoint {
                 let (first, count) = (wanted.start * elements, wanted.len() * elements);
                 self.read_elements(name, entry, first, count, spare)
             }
-            _ => Err(Error::Checkpoint(format!(
-                "source: {name} has shape {} and no slices {wanted:?}",
-                show_shape(&entry.info.shape)
+            _ => Err(Error::Checkpoint(problem!(
+                "source"; "{name} has shape {} and no slices {wanted:?}", show_shape(&entry.info.shape)
             ))),
         }
     }
@@ -263,11 +263,11 @@ impl Checkpoint {
 
     fn entry(&self, name: &str) -> Result<&Entry> {
         match self.duplicates.get(name) {
-            Some(problem) => Err(Error::Checkpoint(format!("source: {problem}"))),
+            Some(problem) => Err(Error::Checkpoint(Problem::new("source", problem))),
             None => self
                 .entries
                 .get(name)
-                .ok_or_else(|| Error::Checkpoint(format!("source: {name} is missing"))),
+                .ok_or_else(|| Error::Checkpoint(problem!("source"; "{name} is missing"))),
         }
     }
 
@@ -308,8 +308,8 @@ impl Checkpoint {
                 widened.extend(values.map(|bits| f16::from_bits(bits).to_f32()));
                 Ok(Elements::F32(widened))
             }
-            other => Err(Error::Checkpoint(format!(
-                "source: {name} is {other:?}, expected F32, BF16 or F16"
+            other => Err(Error::Checkpoint(problem!(
+                "source"; "{name} is {other:?}, expected F32, BF16 or F16"
             ))),
         }
     }
@@ -318,7 +318,7 @@ impl Checkpoint {
         let scale = format!("{name}{SCALE_SUFFIX}");
         let rows = entry.info.shape.first().copied().unwrap_or(1);
         if let Some(problem) = spec::scale_problem(|name| self.describe(name), name, &scale, rows) {
-            return Err(Error::Checkpoint(format!("source: {}", problem.text())));
+            return Err(Error::Checkpoint(Problem::new("source", problem.text())));
         }
         let values: Vec<i8> =
             self.read_plain(name, entry, 0, entry.info.shape.iter().product(), Vec::new())?;
@@ -326,7 +326,7 @@ impl Checkpoint {
             .read_elements(&scale, self.entry(&scale)?, 0, rows, None)?
             .into_f32()?;
         check_int8(name, &values, &scale, &scales)
-            .map_err(|problem| Error::Checkpoint(format!("source: {problem}")))?;
+            .map_err(|problem| Error::Checkpoint(Problem::new("source", problem)))?;
         Ok(Elements::Int8 { values, scales })
     }
 
@@ -353,7 +353,7 @@ impl Checkpoint {
     }
 
     fn add_file(&mut self, path: &Path, rename: impl Fn(String) -> String) -> Result<()> {
-        let bad = |problem: String| Error::Checkpoint(format!("source: {}: {problem}", path.display()));
+        let bad = |problem: String| Error::Checkpoint(problem!("source"; "{}: {problem}", path.display()));
         let file = SourceFile::open(path).map_err(|error| Error::reading("source", path, error))?;
         let header = Header::read(&file).map_err(bad)?;
         for (key, value) in header.metadata {
@@ -403,9 +403,8 @@ impl Checkpoint {
         if problems.is_empty() {
             Ok(())
         } else {
-            Err(Error::Checkpoint(format!(
-                "source: the index and its shards disagree:\n  {}",
-                problems.join("\n  ")
+            Err(Error::Checkpoint(problem!(
+                "source"; "the index and its shards disagree:\n  {}", problems.join("\n  ")
             )))
         }
     }

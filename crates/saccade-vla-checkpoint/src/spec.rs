@@ -37,14 +37,14 @@ impl TensorSpec {
 
 /// One thing that is wrong.
 #[derive(Clone, Debug)]
-pub enum Problem {
+pub enum TensorProblem {
     /// A tensor of another shape.
     Shape(String),
     /// A tensor that is missing, unknown or of another type.
     Other(String),
 }
 
-impl Problem {
+impl TensorProblem {
     /// The tensor, what it is and what was expected.
     #[must_use]
     pub fn text(&self) -> &str {
@@ -62,7 +62,7 @@ pub fn problems<'a>(
     prefix: &str,
     expected: &[TensorSpec],
     is_unused: impl Fn(&str, &[usize]) -> bool,
-) -> Vec<Problem> {
+) -> Vec<TensorProblem> {
     let mut problems = Vec::new();
     let mut known = BTreeSet::new();
     for spec in expected {
@@ -71,11 +71,11 @@ pub fn problems<'a>(
         match describe(&name) {
             // A tensor without elements carries nothing, and some writers leave it out.
             None if spec.shape.contains(&0) => {}
-            None => problems.push(Problem::Other(format!(
+            None => problems.push(TensorProblem::Other(format!(
                 "{name} is missing, expected {}",
                 show_shape(&spec.shape)
             ))),
-            Some((_, shape)) if shape != spec.shape => problems.push(Problem::Shape(format!(
+            Some((_, shape)) if shape != spec.shape => problems.push(TensorProblem::Shape(format!(
                 "{name} has shape {}, expected {}",
                 show_shape(shape),
                 show_shape(&spec.shape)
@@ -95,12 +95,12 @@ pub fn problems<'a>(
                 } else {
                     ""
                 };
-                problems.push(Problem::Other(format!(
+                problems.push(TensorProblem::Other(format!(
                     "{name} is {dtype:?}, expected F32, BF16 or F16{int8}"
                 )));
             }
             Some((dtype, _)) if spec.may_be_int8 && describe(&scale).is_some() => {
-                problems.push(Problem::Other(format!(
+                problems.push(TensorProblem::Other(format!(
                     "{scale} is there, but {name} is {dtype:?}, expected I8"
                 )));
                 known.insert(scale);
@@ -112,7 +112,7 @@ pub fn problems<'a>(
     for name in names.filter(|name| name.starts_with(prefix) && !known.contains(*name)) {
         let shape = describe(name).map_or(&[] as &[usize], |(_, shape)| shape);
         if !is_unused(&name[prefix.len()..], shape) {
-            problems.push(Problem::Other(format!("{name} is unknown")));
+            problems.push(TensorProblem::Other(format!("{name} is unknown")));
         }
     }
     problems
@@ -124,18 +124,18 @@ pub(crate) fn scale_problem<'a>(
     name: &str,
     scale: &str,
     rows: usize,
-) -> Option<Problem> {
+) -> Option<TensorProblem> {
     match describe(scale) {
-        None => Some(Problem::Other(format!(
+        None => Some(TensorProblem::Other(format!(
             "{name} is I8 and {scale} is missing, expected ({rows},)"
         ))),
-        Some((_, shape)) if shape != [rows] => Some(Problem::Shape(format!(
+        Some((_, shape)) if shape != [rows] => Some(TensorProblem::Shape(format!(
             "{scale} has shape {}, expected ({rows},)",
             show_shape(shape)
         ))),
-        Some((dtype, _)) if dtype != Dtype::F32 => {
-            Some(Problem::Other(format!("{scale} is {dtype:?}, expected F32")))
-        }
+        Some((dtype, _)) if dtype != Dtype::F32 => Some(TensorProblem::Other(format!(
+            "{scale} is {dtype:?}, expected F32"
+        ))),
         Some(_) => None,
     }
 }
@@ -147,8 +147,8 @@ fn is_readable(dtype: Dtype) -> bool {
 
 /// The problems, one on a line, of tensors that should fit `what`.
 #[must_use]
-pub fn list(problems: &[Problem], what: &str) -> String {
-    let lines: Vec<&str> = problems.iter().map(Problem::text).collect();
+pub fn list(problems: &[TensorProblem], what: &str) -> String {
+    let lines: Vec<&str> = problems.iter().map(TensorProblem::text).collect();
     let noun = if problems.len() == 1 {
         "tensor does"
     } else {

@@ -1,6 +1,6 @@
 //! Arrays with their shapes: borrowed, borrowed to be written, and owned. The checks that every argument passes.
 
-use crate::error::{Error, Result, show_shape};
+use crate::error::{Error, Result, problem, show_shape};
 
 /// A C-contiguous array: what the public functions take.
 ///
@@ -50,10 +50,9 @@ impl Array<'_, f32> {
     pub(crate) fn check_finite(self, name: &str) -> Result<Self> {
         match first_not_finite(self.data) {
             None => Ok(self),
-            Some(position) => Err(Error::Input(format!(
-                "{name}: expected finite values, got {} at index {}",
-                self.data[position],
-                show_shape(&unravel(position, self.shape))
+            Some(position) => Err(Error::Input(problem!(
+                name; expected "finite values";
+                got "{} at index {}", self.data[position], show_shape(&unravel(position, self.shape))
             ))),
         }
     }
@@ -62,10 +61,10 @@ impl Array<'_, f32> {
     pub(crate) fn check_result(self, name: &str) -> Result<Self> {
         match first_not_finite(self.data) {
             None => Ok(self),
-            Some(position) => Err(Error::Input(format!(
-                "{name}: the result is not finite, {} at index {}: inputs or weights are too large for the arithmetic",
-                self.data[position],
-                show_shape(&unravel(position, self.shape))
+            Some(position) => Err(Error::Input(problem!(
+                name;
+                "the result is not finite, {} at index {}: inputs or weights are too large for the arithmetic",
+                self.data[position], show_shape(&unravel(position, self.shape))
             ))),
         }
     }
@@ -180,9 +179,8 @@ fn check_length(len: usize, shape: &[usize]) -> Result<()> {
     if elements == Some(len) {
         return Ok(());
     }
-    Err(Error::Shape(format!(
-        "shape: {} does not fit {len} elements",
-        show_shape(shape)
+    Err(Error::Shape(problem!(
+        "shape"; "{} does not fit {len} elements", show_shape(shape)
     )))
 }
 
@@ -190,10 +188,8 @@ fn check_shape(name: &str, axes: &str, given: &[usize], expected: &[usize]) -> R
     if given == expected {
         return Ok(());
     }
-    Err(Error::Shape(format!(
-        "{name}: expected {axes} = {}, got {}",
-        show_shape(expected),
-        show_shape(given)
+    Err(Error::Shape(problem!(
+        name; expected "{axes} = {}", show_shape(expected); got "{}", show_shape(given)
     )))
 }
 

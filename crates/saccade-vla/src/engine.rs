@@ -2,7 +2,7 @@
 
 use saccade_vla_kernels::Isa;
 
-use crate::error::{Error, Result};
+use crate::error::{Error, Result, problem};
 use crate::precision::Precision;
 
 /// The most threads that can be asked for: far more than any machine has cores, far fewer than make starting them a problem.
@@ -26,8 +26,8 @@ impl Engine {
         let threads = match num_threads {
             Some(threads) if (1..=MAX_THREADS).contains(&threads) => threads,
             Some(threads) => {
-                return Err(Error::Input(format!(
-                    "num_threads: expected 1 to {MAX_THREADS}, got {threads}"
+                return Err(Error::Input(problem!(
+                    "num_threads"; expected "1 to {MAX_THREADS}"; got "{threads}"
                 )));
             }
             None => saccade_vla_kernels::default_num_threads()?.get(),

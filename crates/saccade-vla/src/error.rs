@@ -2,6 +2,8 @@
 
 use std::path::Path;
 
+pub use saccade_vla_checkpoint::Problem;
+pub(crate) use saccade_vla_checkpoint::problem;
 pub(crate) use saccade_vla_checkpoint::show_shape;
 use saccade_vla_checkpoint::{printable, show_bytes};
 use saccade_vla_kernels::{IsaError, KernelError, NumThreadsError};
@@ -14,21 +16,21 @@ pub type Result<T> = std::result::Result<T, Error>;
 #[non_exhaustive]
 pub enum Error {
     /// An array has the wrong number of axes or the wrong size on one of them.
-    #[error("{}", printable(.0))]
-    Shape(String),
+    #[error("{0}")]
+    Shape(Problem),
     /// A value is out of range, not finite, or belongs to another head.
-    #[error("{}", printable(.0))]
-    Input(String),
+    #[error("{0}")]
+    Input(Problem),
     /// A checkpoint or its configuration is broken, incomplete or of another kind; all problems are listed.
-    #[error("{}", printable(.0))]
-    Checkpoint(String),
+    #[error("{0}")]
+    Checkpoint(Problem),
     /// Text that is not JSON.
     #[error("{}: not valid JSON: {}", printable(what), printable(&source.to_string()))]
     Json {
         /// What should be JSON.
         what: String,
         /// Where and why it is not.
-        source: serde_json::Error,
+        source: Box<dyn std::error::Error + Send + Sync>,
     },
     /// `SACCADE_ISA` names an instruction set that is unknown or that this CPU lacks.
     #[error(transparent)]
@@ -84,6 +86,21 @@ impl Error {
                 source,
             },
             other => other,
+        }
+    }
+
+    /// The argument that is to blame, if one is.
+    #[must_use]
+    pub fn argument(&self) -> Option<&str> {
+        match self {
+            Self::Shape(problem) | Self::Input(problem) | Self::Checkpoint(problem) => problem.argument(),
+            Self::Json { what, .. } => what.split(": ").next(),
+            Self::Memory { what, .. } => Some(what),
+            Self::Isa(_) => Some("SACCADE_ISA"),
+            Self::NumThreads(_) => Some("SACCADE_NUM_THREADS"),
+            Self::Packing(_) => Some("source"),
+            Self::File(error) => error.argument(),
+            Self::Interrupted => None,
         }
     }
 

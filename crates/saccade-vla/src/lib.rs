@@ -33,7 +33,7 @@ pub use backbone::{
     BackboneLoadOptions, BackboneRecord, LanguageConfig, VisionConfig,
 };
 pub use config::HeadConfig;
-pub use error::{Error, ErrorKind, Result};
+pub use error::{Error, ErrorKind, Problem, Result};
 pub use head::action_head::ActionHead;
 pub use head::context::Context;
 pub use head::encode::Features;

@@ -5,7 +5,7 @@ use std::str::FromStr;
 
 use saccade_vla_kernels::{Arithmetic, Element};
 
-use crate::error::{Error, Result};
+use crate::error::{Error, Result, problem};
 
 /// A layer's share of the cost, which decides how precisely it is computed.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -98,7 +98,7 @@ impl FromStr for Precision {
         let known = ALL.into_iter().find(|precision| precision.to_string() == name);
         known.ok_or_else(|| {
             let names = ALL.map(|precision| format!("'{precision}'")).join(", ");
-            Error::Input(format!("precision: expected one of {names}, got '{name}'"))
+            Error::Input(problem!("precision"; expected "one of {names}"; got "'{name}'"))
         })
     }
 }

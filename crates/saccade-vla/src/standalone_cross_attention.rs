@@ -7,7 +7,7 @@ use saccade_vla_kernels::{Activations, Epilogue, LinearScratch, PackedKeyValues}
 use crate::alloc::{collected, filled, product};
 use crate::array::{Array, ArrayMut};
 use crate::engine::Engine;
-use crate::error::{Error, Result, show_shape};
+use crate::error::{Error, Problem, Result, problem, show_shape};
 use crate::nn::attention::{Attention, AttentionBuffers, Bias, CrossKeys};
 use crate::nn::source::memory::{self, MemorySource, TensorViews};
 use crate::nn::source::planner::Planner;
@@ -112,16 +112,17 @@ impl CrossAttention {
         let problems = memory::problems(tensors, &planner.into_plan().specs, |_, _| false);
         if !problems.is_empty() {
             let listed = spec::list(&problems, "the widths of to_q and to_k");
-            return Err(Error::Checkpoint(format!("tensors: {listed}")));
+            return Err(Error::Checkpoint(Problem::new("tensors", listed)));
         }
         if width == 0 || context_dim == 0 {
-            return Err(Error::Checkpoint(format!(
-                "tensors: expected at least one input and output feature, got width {width} and context_dim {context_dim}"
+            return Err(Error::Checkpoint(problem!(
+                "tensors"; expected "at least one input and output feature";
+                got "width {width} and context_dim {context_dim}"
             )));
         }
         if num_heads == 0 || !width.is_multiple_of(num_heads) {
-            return Err(Error::Input(format!(
-                "num_heads: expected a divisor of the width {width}, got {num_heads}"
+            return Err(Error::Input(problem!(
+                "num_heads"; expected "a divisor of the width {width}"; got "{num_heads}"
             )));
         }
         let source = MemorySource::new(tensors);
@@ -251,18 +252,14 @@ impl CrossAttention {
 
     fn check_keys(&self, kv: &KeyValues, batch: usize) -> Result<()> {
         if (kv.num_heads, kv.width) != (self.num_heads, self.width()) {
-            return Err(Error::Input(format!(
-                "kv: expected keys and values of {} heads and width {}, got {} and {}",
-                self.num_heads,
-                self.width(),
-                kv.num_heads,
-                kv.width
+            return Err(Error::Input(problem!(
+                "kv"; expected "keys and values of {} heads and width {}", self.num_heads, self.width();
+                got "{} and {}", kv.num_heads, kv.width
             )));
         }
         if batch != kv.batch {
-            return Err(Error::Shape(format!(
-                "hidden_states: expected the batch of kv, {}, got {batch}",
-                kv.batch
+            return Err(Error::Shape(problem!(
+                "hidden_states"; expected "the batch of kv, {}", kv.batch; got "{batch}"
             )));
         }
         Ok(())
@@ -274,9 +271,9 @@ impl CrossAttention {
                 array.check_finite(name)?;
                 Ok((batch, rows))
             }
-            _ => Err(Error::Shape(format!(
-                "{name}: expected (batch, rows, {width}) with at least one row, got {}",
-                show_shape(array.shape())
+            _ => Err(Error::Shape(problem!(
+                name; expected "(batch, rows, {width}) with at least one row";
+                got "{}", show_shape(array.shape())
             ))),
         }
     }
@@ -313,8 +310,8 @@ fn logit_bias(
                 .iter()
                 .find(|value| value.is_nan() || **value == f32::INFINITY)
             {
-                return Err(Error::Input(format!(
-                    "key_bias: expected finite values or minus infinity, got {bad}"
+                return Err(Error::Input(problem!(
+                    "key_bias"; expected "finite values or minus infinity"; got "{bad}"
                 )));
             }
             collected("key_bias", bias.data().len(), bias.data().iter().copied())?

@@ -42,13 +42,15 @@ fn an_out_of_the_wrong_shape_is_an_error_and_stays_as_it_is() {
             &Sampling::default().with_num_samples(3),
             ArrayMut::new(&mut out, &wrong).unwrap(),
         );
-        let Err(Error::Shape(message)) = result else {
+        let Err(Error::Shape(problem)) = result else {
             panic!("sample, {wrong:?}: {result:?}")
         };
+        let (expected, _) = problem.sides().unwrap();
         assert!(
-            message.starts_with("out: expected (batch, num_samples, action_horizon, action_dim) = (2, 3, "),
-            "{message}"
+            expected.starts_with("(batch, num_samples, action_horizon, action_dim) = (2, 3, "),
+            "{problem}"
         );
+        assert_eq!(problem.argument(), Some("out"));
         let actions_shape = [2, horizon, config.encoder_action_dim];
         let actions = &noise[..actions_shape.iter().product()];
         let noisy = NoisyActions {

@@ -9,6 +9,7 @@ use super::temporary::{TemporaryDirectory, parent_of, unique};
 use crate::companions::OWN_CONFIG;
 use crate::error::{Error, Result};
 use crate::names::is_processor;
+use crate::problem;
 
 /// What a checkpoint may hold in addition to its weights and companions.
 const OWN_FILES: [&str; 3] = ["config.json", "model.safetensors.index.json", OWN_CONFIG];
@@ -26,8 +27,8 @@ pub(super) fn check_replaceable(out: &Path, companions: &BTreeSet<PathBuf>, forc
         Ok(metadata) => metadata,
     };
     if !metadata.is_dir() {
-        return Err(Error::Input(format!(
-            "out: {shown} exists and is not a directory"
+        return Err(Error::Input(problem!(
+            "out"; "{shown} exists and is not a directory"
         )));
     }
     let is_empty = std::fs::read_dir(out).map_err(failed)?.next().is_none();
@@ -45,8 +46,9 @@ pub(super) fn check_replaceable(out: &Path, companions: &BTreeSet<PathBuf>, forc
             let is_own = folder.as_os_str().is_empty()
                 && (OWN_FILES.contains(&&*name) || name.ends_with(".safetensors") && !is_processor(&name));
             if !(kind.is_file() && (is_own || companions.contains(&path))) {
-                return Err(Error::Input(format!(
-                    "out: {shown} holds {name}, which is no part of this checkpoint: choose another directory"
+                return Err(Error::Input(problem!(
+                    "out";
+                    "{shown} holds {name}, which is no part of this checkpoint: choose another directory"
                 )));
             }
         }
@@ -54,8 +56,8 @@ pub(super) fn check_replaceable(out: &Path, companions: &BTreeSet<PathBuf>, forc
     if is_empty || force {
         return Ok(true);
     }
-    Err(Error::Input(format!(
-        "out: {shown} exists already; force replaces it"
+    Err(Error::Input(problem!(
+        "out"; "{shown} exists already; force replaces it"
     )))
 }
 

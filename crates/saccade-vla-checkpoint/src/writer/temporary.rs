@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
 
-use crate::error::{Error, Result};
+use crate::error::{Error, Problem, Result};
 
 /// Numbers the names that this process has used, so that none is used twice.
 static COUNTER: AtomicU64 = AtomicU64::new(0);
@@ -35,10 +35,7 @@ impl TemporaryDirectory {
     /// In the directory of `out`, so that renaming needs no copy.
     pub(super) fn next_to(out: &Path) -> Result<Self> {
         let name = out.file_name().ok_or_else(|| {
-            Error::Input(format!(
-                "out: expected the name of a directory, got {}",
-                out.display()
-            ))
+            Error::Input(Problem::expected("out", "the name of a directory", out.display()))
         })?;
         let parent = parent_of(out);
         std::fs::create_dir_all(parent).map_err(|error| Error::writing(parent, error))?;

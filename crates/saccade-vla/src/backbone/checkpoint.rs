@@ -9,7 +9,7 @@ use super::json::GivenConfig;
 use super::plan::{nbytes, plan};
 use super::recognise::Recognised;
 use crate::engine::Engine;
-use crate::error::{Error, Result};
+use crate::error::{Error, Problem, Result};
 use crate::nn::source::planner::Plan;
 use crate::precision::Precision;
 
@@ -39,7 +39,7 @@ impl BackboneCheckpoint {
         let is_unused = |name: &str, _: &[usize]| found.is_unused(name);
         let problems = checkpoint.problems(found.prefix, &plan.specs, is_unused);
         if !problems.is_empty() {
-            return Err(Error::Checkpoint(format!("source: {}", found.list(&problems))));
+            return Err(Error::Checkpoint(Problem::new("source", found.list(&problems))));
         }
         Ok(Self {
             checkpoint,

@@ -13,7 +13,7 @@ use super::reuse::{longest_prefix, same_view};
 use super::vision::positions::{language_turns, token_positions};
 use crate::alloc::{collected, filled, product, reserve, sized};
 use crate::array::{Array, OwnedArray};
-use crate::error::{Error, Result};
+use crate::error::{Error, Result, problem};
 use crate::nn::rope::Rotation;
 use crate::ops::{first_keys_values, room_for_keys_values};
 
@@ -92,10 +92,9 @@ impl Backbone {
         keep: BackboneKeep,
     ) -> Result<Vec<BackboneFeatures>> {
         if previous.iter().any(|features| features.backbone != self.id) {
-            return Err(Error::Input(
-                "previous: expected features that this backbone made, got those of another backbone"
-                    .to_owned(),
-            ));
+            return Err(Error::Input(problem!(
+                "previous"; expected "features that this backbone made"; got "those of another backbone"
+            )));
         }
         let previous = if keep == BackboneKeep::default() {
             previous

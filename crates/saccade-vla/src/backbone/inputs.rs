@@ -4,8 +4,8 @@ use std::ops::Range;
 
 use super::config::{BackboneConfig, CHANNELS, Tower, VisionConfig};
 use crate::alloc::{collected, filled, reserve};
-use crate::array::Array;
-use crate::error::{Error, Result, show_shape};
+use crate::array::{Array, unravel};
+use crate::error::{Error, Result, problem, show_shape};
 
 /// The inputs of [`Backbone::encode`](super::model::Backbone::encode), as the released processors prepare them.
 #[derive(Clone, Debug)]
@@ -92,15 +92,14 @@ impl<'a> Checked<'a> {
     /// [`Error::Shape`] and [`Error::Input`] for what does not fit.
     pub(super) fn new(config: &BackboneConfig, inputs: &BackboneInputs<'a>) -> Result<Self> {
         let &[batch, num_tokens] = inputs.input_ids.shape() else {
-            return Err(Error::Shape(format!(
-                "input_ids: expected (batch, tokens), got {}",
-                show_shape(inputs.input_ids.shape())
+            return Err(Error::Shape(problem!(
+                "input_ids"; expected "(batch, tokens)"; got "{}", show_shape(inputs.input_ids.shape())
             )));
         };
         if batch == 0 || num_tokens == 0 {
-            return Err(Error::Shape(format!(
-                "input_ids: expected (batch, tokens) with at least one prompt and token, got {}",
-                show_shape(inputs.input_ids.shape())
+            return Err(Error::Shape(problem!(
+                "input_ids"; expected "(batch, tokens) with at least one prompt and token";
+                got "{}", show_shape(inputs.input_ids.shape())
             )));
         }
         if let Some(mask) = inputs.attention_mask {
@@ -118,10 +117,10 @@ impl<'a> Checked<'a> {
             let count = ids.iter().filter(|id| is_image(id)).count();
             let places = (0..num_tokens).filter(|&place| is_image(&ids[place]));
             let end = views_of_prompt(config, &views, first, count).ok_or_else(|| {
-                Error::Input(format!(
-                    "input_ids: prompt {row} has {count} image tokens (id {}), which its views do not fill: from view {first} on they have {}",
-                    config.image_token_id,
-                    show_counts(config, &views[first..]),
+                Error::Input(problem!(
+                    "input_ids";
+                    "prompt {row} has {count} image tokens (id {}), which its views do not fill: from view {first} on they have {}",
+                    config.image_token_id, show_counts(config, &views[first..])
                 ))
             })?;
             prompts.push(Prompt {
@@ -138,10 +137,9 @@ impl<'a> Checked<'a> {
             first = end;
         }
         if first < views.len() {
-            return Err(Error::Input(format!(
-                "pixel_values: {} views were given, but the prompts have image tokens (id {}) for {first}",
-                views.len(),
-                config.image_token_id
+            return Err(Error::Input(problem!(
+                "pixel_values"; "{} views were given, but the prompts have image tokens (id {}) for {first}",
+                views.len(), config.image_token_id
             )));
         }
         Ok(Self {
@@ -193,10 +191,9 @@ fn check_ids(config: &BackboneConfig, ids: &Array<'_, i64>) -> Result<()> {
     let bad = ids.data().iter().position(|id| !(0..=last as i64).contains(id));
     match bad {
         None => Ok(()),
-        Some(position) => Err(Error::Input(format!(
-            "input_ids: expected ids of 0 to {last}, got {} at index {}",
-            ids.data()[position],
-            show_shape(&crate::array::unravel(position, ids.shape()))
+        Some(position) => Err(Error::Input(problem!(
+            "input_ids"; expected "ids of 0 to {last}";
+            got "{} at index {}", ids.data()[position], show_shape(&unravel(position, ids.shape()))
         ))),
     }
 }
@@ -208,14 +205,16 @@ fn views<'a>(config: &BackboneConfig, inputs: &BackboneInputs<'a>) -> Result<Vec
         array.check_finite(&name(index, several))?;
     }
     match (config.vision.tower, inputs.image_grid_thw) {
-        (Tower::Siglip { .. }, Some(_)) => Err(Error::Input(format!(
-            "image_grid_thw: expected none, since GR00T {} takes images, not patches",
+        (Tower::Siglip { .. }, Some(_)) => Err(Error::Input(problem!(
+            "image_grid_thw"; "expected none, since GR00T {} takes images, not patches",
             config.version.to_uppercase()
         ))),
         (Tower::Siglip { .. }, None) => images(&config.vision, inputs),
-        (Tower::Qwen3Vl { .. }, None) => Err(Error::Input(format!(
-            "image_grid_thw: expected (views, 3), the patches of each view, since GR00T {} takes patches, got none",
-            config.version.to_uppercase()
+        (Tower::Qwen3Vl { .. }, None) => Err(Error::Input(problem!(
+            "image_grid_thw";
+            expected "(views, 3), the patches of each view, since GR00T {} takes patches",
+            config.version.to_uppercase();
+            got "none"
         ))),
         (Tower::Qwen3Vl { patch_elements, .. }, Some(grid)) => {
             patches(&config.vision, patch_elements, &inputs.pixel_values, grid)
@@ -250,10 +249,8 @@ fn images<'a>(config: &VisionConfig, inputs: &BackboneInputs<'a>) -> Result<Vec<
                 Some(size) => format!("(views, {CHANNELS}, {size}, {size})"),
                 None => format!("(views, {CHANNELS}, height, width) with sides that are multiples of {unit}"),
             };
-            return Err(Error::Shape(format!(
-                "{}: expected {sides}, got {}",
-                name(index, several),
-                show_shape(array.shape())
+            return Err(Error::Shape(problem!(
+                name(index, several); expected "{sides}"; got "{}", show_shape(array.shape())
             )));
         }
         let (height, width) = (array.shape()[2], array.shape()[3]);
@@ -278,22 +275,19 @@ fn patches<'a>(
     grid: Array<'a, i64>,
 ) -> Result<Vec<ViewPixels<'a>>> {
     let [array] = pixel_values else {
-        return Err(Error::Shape(format!(
-            "pixel_values: expected one array of patches, got {}",
-            pixel_values.len()
+        return Err(Error::Shape(problem!(
+            "pixel_values"; expected "one array of patches"; got "{}", pixel_values.len()
         )));
     };
     let (&[num_patches, width], &[_, 3]) = (array.shape(), grid.shape()) else {
-        return Err(Error::Shape(format!(
-            "pixel_values, image_grid_thw: expected (patches, {patch_elements}) and (views, 3), got {} and {}",
-            show_shape(array.shape()),
-            show_shape(grid.shape())
+        return Err(Error::Shape(problem!(
+            "pixel_values, image_grid_thw"; expected "(patches, {patch_elements}) and (views, 3)";
+            got "{} and {}", show_shape(array.shape()), show_shape(grid.shape())
         )));
     };
     if width != patch_elements {
-        return Err(Error::Shape(format!(
-            "pixel_values: expected (patches, {patch_elements}), got {}",
-            show_shape(array.shape())
+        return Err(Error::Shape(problem!(
+            "pixel_values"; expected "(patches, {patch_elements})"; got "{}", show_shape(array.shape())
         )));
     }
     let mut views = Vec::new();
@@ -305,9 +299,9 @@ fn patches<'a>(
             (side > 0 && side.is_multiple_of(config.merge)).then_some(side)
         };
         let (1, Some(rows), Some(columns)) = (sizes[0], side(sizes[1]), side(sizes[2])) else {
-            return Err(Error::Input(format!(
-                "image_grid_thw: expected (1, rows, columns) with multiples of {}, got ({}, {}, {}) for view {index}",
-                config.merge, sizes[0], sizes[1], sizes[2]
+            return Err(Error::Input(problem!(
+                "image_grid_thw"; expected "(1, rows, columns) with multiples of {}", config.merge;
+                got "({}, {}, {}) for view {index}", sizes[0], sizes[1], sizes[2]
             )));
         };
         let len = rows
@@ -329,7 +323,8 @@ fn patches<'a>(
 }
 
 fn does_not_fit(num_patches: usize, view: usize) -> Error {
-    Error::Shape(format!(
-        "image_grid_thw: expected grids of the {num_patches} patches in pixel_values together, got others up to view {view}"
+    Error::Shape(problem!(
+        "image_grid_thw"; expected "grids of the {num_patches} patches in pixel_values together";
+        got "others up to view {view}"
     ))
 }

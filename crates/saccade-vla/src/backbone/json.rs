@@ -8,7 +8,7 @@ use super::config::{BackboneConfig, CHANNELS, LanguageConfig, Tower, VisionConfi
 use super::consistency::contradictions;
 use super::released::{Release, TowerKind};
 use crate::config::{Object, Version};
-use crate::error::{Error, Result};
+use crate::error::{Error, Problem, Result, problem};
 
 /// No size in a config is larger: products of three of them stay far below `u64::MAX`.
 const MAX_SIZE: u64 = 1 << 20;
@@ -32,14 +32,14 @@ impl GivenConfig {
     /// # Errors
     /// [`Error::Json`] for text that is not JSON; [`Error::Checkpoint`] if it is no object.
     pub(crate) fn parse(text: &str) -> Result<Self> {
-        let bad = |problem: String| Err(Error::Checkpoint(format!("config: {problem}")));
+        let bad = |problem: String| Err(Error::Checkpoint(Problem::new("config", problem)));
         let top = match serde_json::from_str(text) {
             Ok(Value::Object(top)) => top,
             Ok(_) => return bad("expected a JSON object".to_owned()),
             Err(source) => {
                 return Err(Error::Json {
                     what: "config".to_owned(),
-                    source,
+                    source: source.into(),
                 });
             }
         };
@@ -64,8 +64,8 @@ impl GivenConfig {
     pub(crate) fn version(&self) -> Result<Option<(Version, String)>> {
         let unknown = |what: &str, name: &str| {
             let names = Version::model_types();
-            Err(Error::Checkpoint(format!(
-                "config: {what} is \"{name}\", expected one of {names}"
+            Err(Error::Checkpoint(problem!(
+                "config"; "{what} is \"{name}\", expected one of {names}"
             )))
         };
         if let Some(Value::String(kind)) = self.top.get("kind") {
@@ -101,9 +101,8 @@ impl GivenConfig {
         if reader.problems.is_empty() {
             return Ok(config);
         }
-        Err(Error::Checkpoint(format!(
-            "config: {}",
-            reader.problems.join("; ")
+        Err(Error::Checkpoint(problem!(
+            "config"; "{}", reader.problems.join("; ")
         )))
     }
 }

@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use saccade_vla_checkpoint::granted;
-use saccade_vla_checkpoint::spec::Problem;
+use saccade_vla_checkpoint::spec::TensorProblem;
 
 use super::checkpoint::BackboneCheckpoint;
 use super::json::GivenConfig;
@@ -12,7 +12,7 @@ use super::model::Backbone;
 use super::plan::plan;
 use super::recognise::Recognised;
 use crate::engine::Engine;
-use crate::error::{Error, Result};
+use crate::error::{Error, Problem, Result};
 use crate::nn::source::file::FileSource;
 use crate::nn::source::memory::{self, MemorySource, TensorViews};
 use crate::nn::weights::{Builder, Source};
@@ -103,12 +103,12 @@ impl Backbone {
         let own: TensorViews<'_> = own.collect();
         let problems = memory::problems(&own, &plan.specs, |name, _| found.is_unused(name));
         if !problems.is_empty() {
-            let message = format!("tensors: {}", found.list(&problems));
-            let is_shape = |problem: &Problem| matches!(problem, Problem::Shape(_));
+            let problem = Problem::new("tensors", found.list(&problems));
+            let is_shape = |problem: &TensorProblem| matches!(problem, TensorProblem::Shape(_));
             return Err(if problems.iter().all(is_shape) {
-                Error::Shape(message)
+                Error::Shape(problem)
             } else {
-                Error::Checkpoint(message)
+                Error::Checkpoint(problem)
             });
         }
         Self::build(&MemorySource::new(&own), engine, &found)

@@ -1,11 +1,11 @@
 //! Where a backbone is in a checkpoint, of which release it is, and what its tensors are called.
 
-use saccade_vla_checkpoint::spec::{self, Problem};
+use saccade_vla_checkpoint::spec::{self, TensorProblem};
 
 use super::config::BackboneConfig;
 use super::json::GivenConfig;
 use super::released::{Names, Release};
-use crate::error::{Error, Result};
+use crate::error::{Error, Result, problem};
 
 /// What the names of a backbone's tensors begin with: lerobot's checkpoints, NVIDIA's, a backbone alone.
 pub(super) const PREFIXES: [&str; 3] = ["_groot_model.backbone.", "backbone.", ""];
@@ -51,19 +51,16 @@ impl Recognised {
                 let show = |(prefix, release): (&str, &Release)| {
                     format!("of GR00T {} under `{prefix}`", release.version.title())
                 };
-                return Err(Error::Checkpoint(format!(
-                    "source: two backbones in one checkpoint, {} and {}",
-                    show(first),
-                    show(second)
+                return Err(Error::Checkpoint(problem!(
+                    "source"; "two backbones in one checkpoint, {} and {}", show(first), show(second)
                 )));
             }
         };
         if let Some((version, words)) = given.version()?
             && version != release.version
         {
-            return Err(Error::Checkpoint(format!(
-                "config: {words}, but the tensors are those of GR00T {}",
-                release.version.title()
+            return Err(Error::Checkpoint(problem!(
+                "config"; "{words}, but the tensors are those of GR00T {}", release.version.title()
             )));
         }
         let config = given.read(release)?;
@@ -122,7 +119,7 @@ impl Recognised {
     }
 
     /// All problems, one on a line.
-    pub(super) fn list(&self, problems: &[Problem]) -> String {
+    pub(super) fn list(&self, problems: &[TensorProblem]) -> String {
         let what = format!("the backbone of GR00T {}", self.release.version.title());
         spec::list(problems, &what)
     }
@@ -140,21 +137,17 @@ fn nothing_found<'a>(mut names: impl Iterator<Item = &'a str> + Clone) -> Error 
         let known: Vec<String> = Release::all()
             .map(|release| format!("{} ({})", release.names.vision, release.version.title()))
             .collect();
-        return Error::Checkpoint(format!(
-            "source: the backbone is of a model that is not known: it has {name}, expected names that begin with one of {}",
+        return Error::Checkpoint(problem!(
+            "source";
+            "the backbone is of a model that is not known: it has {name}, expected names that begin with one of {}",
             known.join(", ")
         ));
     }
     let first = names
         .next()
         .map_or_else(String::new, |name| format!(", such as {name}"));
-    Error::Checkpoint(format!(
-        "source: there is no backbone among the {count} tensors{first}: expected names that begin with {}",
-        PREFIXES
-            .iter()
-            .filter(|prefix| !prefix.is_empty())
-            .map(|prefix| format!("`{prefix}`"))
-            .collect::<Vec<_>>()
-            .join(" or ")
+    Error::Checkpoint(problem!(
+        "source"; "there is no backbone among the {count} tensors{first}: expected names that begin with {}",
+        PREFIXES .iter() .filter(|prefix| !prefix.is_empty()) .map(|prefix| format!("`{prefix}`")) .collect::<Vec<_>>() .join(" or ")
     ))
 }

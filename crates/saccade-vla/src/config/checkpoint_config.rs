@@ -3,7 +3,7 @@
 use serde_json::{Map, Value};
 
 use super::versions::Version;
-use crate::error::{Error, Result};
+use crate::error::{Error, Problem, Result};
 
 /// A JSON object.
 pub(crate) type Object = Map<String, Value>;
@@ -33,14 +33,14 @@ impl CheckpointConfig {
     /// # Errors
     /// [`Error::Json`] for text that is not JSON; [`Error::Checkpoint`] if it is no object, and if the head's config in it is none or has saccade's key next to it.
     pub(crate) fn parse(text: &str) -> Result<Self> {
-        let bad = |problem: String| Err(Error::Checkpoint(format!("config: {problem}")));
+        let bad = |problem: String| Err(Error::Checkpoint(Problem::new("config", problem)));
         let mut top = match serde_json::from_str(text) {
             Ok(Value::Object(top)) => top,
             Ok(_) => return bad("expected a JSON object".to_owned()),
             Err(source) => {
                 return Err(Error::Json {
                     what: "config".to_owned(),
-                    source,
+                    source: source.into(),
                 });
             }
         };

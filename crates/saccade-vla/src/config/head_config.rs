@@ -4,7 +4,7 @@
 //! are used everywhere else.
 
 use super::versions::{Feature, Version};
-use crate::error::{Error, Result};
+use crate::error::{Error, Result, problem};
 
 /// The sizes and switches of an action head.
 #[derive(Clone, Debug, PartialEq)]
@@ -112,8 +112,8 @@ impl HeadConfig {
             false => (MAX_SIZE as usize, ""),
         };
         if !(1..=limit).contains(&action_horizon) {
-            return Err(Error::Input(format!(
-                "action_horizon: expected 1 to {limit}{what}, got {action_horizon}"
+            return Err(Error::Input(problem!(
+                "action_horizon"; expected "1 to {limit}{what}"; got "{action_horizon}"
             )));
         }
         Ok(Self {
@@ -130,14 +130,16 @@ impl HeadConfig {
     pub fn with_num_states(self, num_states: usize) -> Result<Self> {
         let has_history = Version::named(&self.version).is_some_and(|one| one.has(Feature::StateHistory));
         if has_history && num_states != self.state_history {
-            return Err(Error::Input(format!(
-                "num_states: expected {}, since {} makes one row of its last states (state_history_length), got {num_states}",
-                self.state_history, self.version
+            return Err(Error::Input(problem!(
+                "num_states";
+                expected "{}, since {} makes one row of its last states (state_history_length)",
+                self.state_history, self.version;
+                got "{num_states}"
             )));
         }
         if !(1..=MAX_SIZE as usize).contains(&num_states) {
-            return Err(Error::Input(format!(
-                "num_states: expected 1 to {MAX_SIZE}, got {num_states}"
+            return Err(Error::Input(problem!(
+                "num_states"; expected "1 to {MAX_SIZE}"; got "{num_states}"
             )));
         }
         Ok(Self { num_states, ..self })

@@ -8,7 +8,7 @@ use super::checkpoint_config::{CheckpointConfig, OWN_KEY, Object};
 use super::consistency::contradictions;
 use super::head_config::{HeadConfig, MAX_SIZE};
 use super::versions::{FEATURE_KEYS, Feature, Version};
-use crate::error::{Error, Result};
+use crate::error::{Error, Result, problem};
 
 /// No head has more blocks; the names of their tensors are written out.
 const MAX_LAYERS: u64 = 1024;
@@ -36,9 +36,8 @@ impl HeadConfig {
         if reader.problems.is_empty() {
             return Ok(head);
         }
-        Err(Error::Checkpoint(format!(
-            "config: {}",
-            reader.problems.join("; ")
+        Err(Error::Checkpoint(problem!(
+            "config"; "{}", reader.problems.join("; ")
         )))
     }
 }

@@ -5,7 +5,7 @@ use super::context::Context;
 use super::sample::Sampling;
 use crate::alloc::reserve;
 use crate::array::{Array, ArrayMut};
-use crate::error::{Error, Result, show_shape};
+use crate::error::{Error, Problem, Result, problem, show_shape};
 use crate::inspect::extent::Extent;
 use crate::inspect::intervention::Intervention;
 use crate::sampling::chunking::Seam;
@@ -15,9 +15,9 @@ impl ActionHead {
         if context.head == self.id {
             return Ok(());
         }
-        Err(Error::Input(
-            "context: expected one that this head encoded, got that of another head".to_owned(),
-        ))
+        Err(Error::Input(problem!(
+            "context"; expected "one that this head encoded"; got "that of another head"
+        )))
     }
 
     pub(super) fn check_state<'a>(&self, state: Array<'a>, batch: usize) -> Result<&'a [f32]> {
@@ -31,10 +31,11 @@ impl ActionHead {
                 ),
                 _ => format!("the last {count} states, (batch, num_states, state_dim)"),
             };
-            return Err(Error::Shape(format!(
-                "state: expected {axes} = {}, normalised and zero-padded to state_dim as the checkpoint's normaliser does, got {}",
-                show_shape(&[batch, count, width]),
-                show_shape(state.shape())
+            return Err(Error::Shape(problem!(
+                "state";
+                expected "{axes} = {}, normalised and zero-padded to state_dim as the checkpoint's normaliser does",
+                show_shape(&[batch, count, width]);
+                got "{}", show_shape(state.shape())
             )));
         }
         Ok(state.check_finite("state")?.data())
@@ -46,8 +47,8 @@ impl ActionHead {
         if (1..=buckets).contains(&num_steps) {
             return Ok(num_steps);
         }
-        Err(Error::Input(format!(
-            "num_steps: expected 1 to {buckets} (num_timestep_buckets), got {num_steps}"
+        Err(Error::Input(problem!(
+            "num_steps"; expected "1 to {buckets} (num_timestep_buckets)"; got "{num_steps}"
         )))
     }
 
@@ -64,7 +65,7 @@ impl ActionHead {
                 let axes = "(batch, action_horizon, encoder_action_dim)";
                 noise.check_shape("noise", axes, &[batch, horizon, width])?;
             }
-            Some(0) => return Err(Error::Input("num_samples: expected at least 1, got 0".to_owned())),
+            Some(0) => return Err(Error::Input(Problem::expected("num_samples", "at least 1", "0"))),
             Some(samples) => {
                 let axes = "(batch, num_samples, action_horizon, encoder_action_dim)";
                 noise.check_shape("noise", axes, &[batch, samples, horizon, width])?;
@@ -130,12 +131,11 @@ impl ActionHead {
     fn embodiment_error(&self, id: i64) -> Error {
         let last = self.config.num_embodiments - 1;
         if (0..=last as i64).contains(&id) {
-            return Error::Input(format!(
-                "embodiment_id: {id} is not loaded, only {:?} are",
-                self.embodiment_ids
+            return Error::Input(problem!(
+                "embodiment_id"; "{id} is not loaded, only {:?} are", self.embodiment_ids
             ));
         }
-        Error::Input(format!("embodiment_id: expected 0 to {last}, got {id}"))
+        Error::Input(problem!("embodiment_id"; expected "0 to {last}"; got "{id}"))
     }
 
     /// The sizes of a call on `context`.
@@ -160,9 +160,7 @@ impl ActionHead {
         for &given in timestep.data() {
             let timestep = usize::try_from(given).ok().filter(|timestep| *timestep <= last);
             timesteps.push(timestep.ok_or_else(|| {
-                Error::Input(format!(
-                    "timestep: expected a bucket from 0 to {last}, got {given}"
-                ))
+                Error::Input(problem!("timestep"; expected "a bucket from 0 to {last}"; got "{given}"))
             })?);
         }
         timesteps.resize(batch, timesteps[0]);

@@ -6,7 +6,7 @@ use super::embodiments::Embodiments;
 use super::layers::HeadLayers;
 use super::plan::{is_unused, specs_of};
 use crate::engine::Engine;
-use crate::error::{Error, Result};
+use crate::error::{Error, Problem, Result};
 use crate::nn::source::sizer::Sizer;
 use crate::nn::weights::Builder;
 use crate::precision::Precision;
@@ -26,7 +26,7 @@ impl HeadCheckpoint {
             return Ok(());
         }
         let listed = spec::list(&problems, "the config");
-        Err(Error::Checkpoint(format!("source: {listed}")))
+        Err(Error::Checkpoint(Problem::new("source", listed)))
     }
 
     /// Whether the head has a tensor `name`, without the prefix.

@@ -6,7 +6,7 @@ use super::vl_encoder::VlTokens;
 use crate::alloc::{collected, reserve};
 use crate::array::Array;
 use crate::config::Reads;
-use crate::error::{Error, Result, show_shape};
+use crate::error::{Error, Result, problem, show_shape};
 use crate::inspect::trace::Keep;
 
 /// The observation given to [`ActionHead::encode`].
@@ -134,15 +134,16 @@ impl ActionHead {
         let array = features.backbone_features;
         let context_dim = self.config.context_dim;
         let &[batch, num_vl_tokens, width] = array.shape() else {
-            return Err(Error::Shape(format!(
-                "backbone_features: expected (batch, num_vl_tokens, {context_dim}), got {}",
-                show_shape(array.shape())
+            return Err(Error::Shape(problem!(
+                "backbone_features"; expected "(batch, num_vl_tokens, {context_dim})";
+                got "{}", show_shape(array.shape())
             )));
         };
         if width != context_dim || batch == 0 || num_vl_tokens == 0 {
-            return Err(Error::Shape(format!(
-                "backbone_features: expected (batch, num_vl_tokens, {context_dim}) with at least one observation and token, got {}",
-                show_shape(array.shape())
+            return Err(Error::Shape(problem!(
+                "backbone_features";
+                expected "(batch, num_vl_tokens, {context_dim}) with at least one observation and token";
+                got "{}", show_shape(array.shape())
             )));
         }
         array.check_finite("backbone_features")?;
@@ -162,18 +163,20 @@ impl ActionHead {
                 .attention_mask
                 .is_some_and(|mask| mask.data().contains(&false))
         {
-            return Err(Error::Input(format!(
-                "attention_mask: expected no false entry, since this head (GR00T {}) ignores padding masks: leave the mask out to attend to \
+            return Err(Error::Input(problem!(
+                "attention_mask";
+                "expected no false entry, since this head (GR00T {}) ignores padding masks: leave the mask out to attend to \
                  padding as the released code does, or give its complement as drop_vl to remove these positions",
                 self.config.version.to_uppercase()
             )));
         }
         if !ignores_masks && features.image_mask.is_none() {
-            return Err(Error::Input(
-                "image_mask: expected (batch, num_vl_tokens) booleans, true for image tokens, since this head's blocks alternate between \
-                 text and images, got none"
-                    .to_owned(),
-            ));
+            return Err(Error::Input(problem!(
+                "image_mask";
+                expected "(batch, num_vl_tokens) booleans, true for image tokens, since this head's blocks alternate between \
+                 text and images";
+                got "none"
+            )));
         }
         Ok((batch, num_vl_tokens))
     }
@@ -204,9 +207,11 @@ impl ActionHead {
                     Reads::Images => ("image", "true"),
                     _ => ("text", "false"),
                 };
-                return Err(Error::Input(format!(
-                    "image_mask: expected at least one {kind} token ({what}) in each observation that is attended and not dropped, since some \
-                     of this head's blocks see nothing else, got none in observation {element}"
+                return Err(Error::Input(problem!(
+                    "image_mask";
+                    expected "at least one {kind} token ({what}) in each observation that is attended and not dropped, since some \
+                     of this head's blocks see nothing else";
+                    got "none in observation {element}"
                 )));
             }
             seen.push(Seen { reads, positions });

@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use saccade_vla_checkpoint::granted;
-use saccade_vla_checkpoint::spec::{self, Problem};
+use saccade_vla_checkpoint::spec::{self, TensorProblem};
 
 use super::action_head::ActionHead;
 use super::embodiments::{Embodiments, chosen_embodiments};
@@ -12,7 +12,7 @@ use super::plan::{is_unused, reading_order, specs_of};
 use super::state_dropout::{STATE_DROPOUT, StateDropout, reads_state_dropout};
 use crate::config::HeadConfig;
 use crate::engine::Engine;
-use crate::error::{Error, Result};
+use crate::error::{Error, Problem, Result, problem};
 use crate::nn::source::file::FileSource;
 use crate::nn::source::memory::{self, MemorySource, TensorViews};
 use crate::nn::weights::{Builder, Source};
@@ -151,7 +151,9 @@ impl ActionHead {
     pub fn from_tensors(tensors: &TensorViews<'_>, options: &LoadOptions) -> Result<Self> {
         let engine = Engine::new(options.precision, options.num_threads)?;
         let given_config = options.config.as_deref().ok_or_else(|| {
-            Error::Input("config: expected one, since tensors in memory bring none".to_owned())
+            Error::Input(problem!(
+                "config"; "expected one, since tensors in memory bring none"
+            ))
         })?;
         let config = options.rows_of(HeadConfig::from_json(given_config)?)?;
         let embodiment_ids =
@@ -161,12 +163,12 @@ impl ActionHead {
             is_unused(&config, name, shape)
         });
         if !problems.is_empty() {
-            let message = format!("tensors: {}", spec::list(&problems, "the config"));
-            let is_shape = |problem: &Problem| matches!(problem, Problem::Shape(_));
+            let problem = Problem::new("tensors", spec::list(&problems, "the config"));
+            let is_shape = |problem: &TensorProblem| matches!(problem, TensorProblem::Shape(_));
             return Err(if problems.iter().all(is_shape) {
-                Error::Shape(message)
+                Error::Shape(problem)
             } else {
-                Error::Checkpoint(message)
+                Error::Checkpoint(problem)
             });
         }
         let drops_states = reads_state_dropout(given_config, has(STATE_DROPOUT))?;

@@ -6,7 +6,7 @@ use super::dit::{ActiveRows, Pass};
 use super::workspace::Workspace;
 use crate::alloc::{reserve, sized};
 use crate::array::{Array, ArrayMut, unravel};
-use crate::error::{Error, Result, show_shape};
+use crate::error::{Error, Result, problem, show_shape};
 use crate::inspect::changes::Changes;
 use crate::inspect::intervention::Intervention;
 use crate::inspect::trace::{Recorded, StepBlock};
@@ -238,10 +238,10 @@ impl ActionHead {
         if let Some(row) = rows().position(is_bad) {
             let column = x[row * width..].iter().position(|value| !value.is_finite());
             let position = row * width + column.unwrap_or(0);
-            return Err(Error::Input(format!(
-                "actions: the result is not finite, {} at index {}: inputs or weights are too large for the arithmetic",
-                x[position],
-                show_shape(&unravel(position, shape))
+            return Err(Error::Input(problem!(
+                "actions";
+                "the result is not finite, {} at index {}: inputs or weights are too large for the arithmetic",
+                x[position], show_shape(&unravel(position, shape))
             )));
         }
         for (row, out) in rows().zip(out.chunks_exact_mut(action_dim)) {
@@ -254,9 +254,9 @@ impl ActionHead {
 /// The number of evaluations from one that runs all rows to the next.
 pub(super) fn check_refresh(future_refresh: Option<usize>) -> Result<usize> {
     match future_refresh {
-        Some(0) => Err(Error::Input(
-            "future_refresh: expected at least 1, got 0".to_owned(),
-        )),
+        Some(0) => Err(Error::Input(problem!(
+            "future_refresh"; expected "at least 1"; got "0"
+        ))),
         given => Ok(given.unwrap_or(1)),
     }
 }

@@ -7,7 +7,7 @@ use serde_json::Value;
 
 use crate::alloc::sized;
 use crate::config::CheckpointConfig;
-use crate::error::{Error, Result};
+use crate::error::{Error, Problem, Result, problem};
 use crate::nn::weights::Weights;
 use saccade_vla_kernels::Activations;
 
@@ -42,16 +42,16 @@ pub(super) fn reads_state_dropout(config: &str, is_there: bool) -> Result<bool> 
     };
     match given {
         Value::Object(by_tag) if !is_there && by_tag.values().any(is_always) => {
-            Err(Error::Checkpoint(format!(
+            Err(Error::Checkpoint(Problem::from(format!(
                 "{STATE_DROPOUT} is missing, but {CONFIG_KEY} is {given} in the config: expected the tensor, which tells \
                  whose states are set to zero"
-            )))
+            ))))
         }
         // The released class then has no such tensor, and ignores that of a file.
         Value::Null | Value::Bool(false) => Ok(false),
         Value::Object(by_tag) => Ok(is_there && !by_tag.is_empty()),
-        _ => Err(Error::Checkpoint(format!(
-            "config: {CONFIG_KEY} is {given}, expected a probability for each embodiment tag"
+        _ => Err(Error::Checkpoint(problem!(
+            "config"; "{CONFIG_KEY} is {given}, expected a probability for each embodiment tag"
         ))),
     }
 }

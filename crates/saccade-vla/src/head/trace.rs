@@ -6,7 +6,7 @@ use super::dit::{ActiveRows, Pass};
 use super::sample::{Sampling, Steps};
 use crate::alloc::filled;
 use crate::array::{Array, OwnedArray};
-use crate::error::{Error, Result};
+use crate::error::{Error, Result, problem};
 use crate::inspect::changes::Changes;
 use crate::inspect::groups::Groups;
 use crate::inspect::trace::{Recorded, Shapes, StepBlock, Trace, TraceOptions};
@@ -90,18 +90,18 @@ impl ActionHead {
 /// That a call of these options is one that a trace can be made of.
 fn check_traceable(sampling: &Sampling<'_>) -> Result<()> {
     if let Some(samples) = sampling.num_samples {
-        return Err(Error::Input(format!(
-            "num_samples: expected none, since a trace is of one chunk an observation, got {samples}"
+        return Err(Error::Input(problem!(
+            "num_samples"; expected "none, since a trace is of one chunk an observation"; got "{samples}"
         )));
     }
     if sampling.integrator != Integrator::Euler {
-        return Err(Error::Input(
-            "integrator: expected euler, since a trace has one evaluation a step, got midpoint".to_owned(),
-        ));
+        return Err(Error::Input(problem!(
+            "integrator"; expected "euler, since a trace has one evaluation a step"; got "midpoint"
+        )));
     }
     if let Some(refresh) = sampling.future_refresh {
-        return Err(Error::Input(format!(
-            "future_refresh: expected none, since a trace is of all rows at every step, got {refresh}"
+        return Err(Error::Input(problem!(
+            "future_refresh"; expected "none, since a trace is of all rows at every step"; got "{refresh}"
         )));
     }
     Ok(())

@@ -6,7 +6,7 @@ use super::sample::{Sampling, check_refresh};
 use crate::alloc::{collected, filled, product};
 use crate::array::{Array, ArrayMut};
 use crate::config::Reads;
-use crate::error::{Error, Result};
+use crate::error::{Error, Problem, Result, problem};
 use crate::sampling::timestep::timestep;
 
 /// Elements of tokens and rows that a warm-up may ask for: 8 GB in float32, far above any batch that a CPU is given.
@@ -31,14 +31,15 @@ impl ActionHead {
             ("num_samples", num_samples.unwrap_or(1)),
         ] {
             if size == 0 {
-                return Err(Error::Input(format!("{name}: expected at least 1, got 0")));
+                return Err(Error::Input(Problem::expected(name, "at least 1", "0")));
             }
         }
         self.check_warmup(num_vl_tokens, batch, num_samples.unwrap_or(1))?;
         let kinds = self.kinds();
         if kinds.len() > num_vl_tokens {
-            return Err(Error::Input(format!(
-                "num_vl_tokens: expected at least 2, one of text and one of an image, got {num_vl_tokens}"
+            return Err(Error::Input(problem!(
+                "num_vl_tokens"; expected "at least 2, one of text and one of an image";
+                got "{num_vl_tokens}"
             )));
         }
         let config = &self.config;
@@ -91,8 +92,9 @@ impl ActionHead {
             .and_then(|(rows, tokens)| rows.checked_add(tokens)?.checked_mul(batch));
         match elements {
             Some(elements) if elements <= MAX_WARMUP_ELEMENTS => Ok(()),
-            _ => Err(Error::Input(format!(
-                "num_vl_tokens, batch, num_samples: expected sizes whose rows fit in memory, got {num_vl_tokens}, {batch}, {num_samples}"
+            _ => Err(Error::Input(problem!(
+                "num_vl_tokens, batch, num_samples"; expected "sizes whose rows fit in memory";
+                got "{num_vl_tokens}, {batch}, {num_samples}"
             ))),
         }
     }

@@ -10,7 +10,7 @@ use super::extent::Extent;
 use super::groups::{Group, Groups, check_indices};
 use super::intervention::{Intervention, Patch};
 use crate::alloc::{filled, product, reserve};
-use crate::error::{Error, Result, show_shape};
+use crate::error::{Error, Result, problem, show_shape};
 
 /// All interventions of one call, in the form in which blocks use them.
 pub(crate) struct Changes<'a> {
@@ -82,8 +82,9 @@ impl<'a> Changes<'a> {
         };
         match self.patches.iter().find(stays) {
             None => Ok(()),
-            Some(PatchedRows { step, block, .. }) => Err(Error::Input(format!(
-                "patch[({step}, {block})]: expected action tokens, since with future_refresh {refresh} the rows of state and future tokens \
+            Some(PatchedRows { step, block, .. }) => Err(Error::Input(problem!(
+                format_args!("patch[({step}, {block})]");
+                "expected action tokens, since with future_refresh {refresh} the rows of state and future tokens \
                  do not always run at step {step}"
             ))),
         }
@@ -131,8 +132,9 @@ impl<'a> Changes<'a> {
         let held: usize = self.biases.iter().map(|bias| bias.values.len()).sum();
         let bytes = 4 * (held as u128 + heads as u128 * rows as u128 * keys as u128);
         if bytes > MAX_BIAS_BYTES {
-            return Err(Error::Input(format!(
-                "intervention: cuts and biases over {heads} heads, {rows} rows and {keys} keys need {bytes} bytes, expected at most \
+            return Err(Error::Input(problem!(
+                "intervention";
+                "cuts and biases over {heads} heads, {rows} rows and {keys} keys need {bytes} bytes, expected at most \
                  {MAX_BIAS_BYTES}; give fewer of them heads, blocks or steps of their own"
             )));
         }
@@ -156,9 +158,9 @@ impl<'a> Changes<'a> {
             .iter()
             .any(|value| value.is_nan() || *value == f32::INFINITY)
         {
-            return Err(Error::Input(
-                "key_bias: expected biases whose sum for a key is below infinity".to_owned(),
-            ));
+            return Err(Error::Input(problem!(
+                "key_bias"; "expected biases whose sum for a key is below infinity"
+            )));
         }
         Ok(bias)
     }
@@ -256,9 +258,9 @@ impl<'a> PatchedRows<'a> {
         check_indices("patch: step", &[patch.step], extent.num_steps)?;
         check_indices("patch: block", &[patch.block], config.num_layers)?;
         if patch.tokens.group == Group::Vl {
-            return Err(Error::Input(
-                "patch: blocks change rows, not vl; expected state, future or action".to_owned(),
-            ));
+            return Err(Error::Input(problem!(
+                "patch"; "blocks change rows, not vl; expected state, future or action"
+            )));
         }
         let name = format!("patch[({}, {})]", patch.step, patch.block);
         let count = groups.check(&name, &patch.tokens)?;
@@ -267,12 +269,11 @@ impl<'a> PatchedRows<'a> {
             shape if shape == [count, width] => 0,
             shape if shape == [extent.batch, count, width] => count * width,
             shape => {
-                return Err(Error::Shape(format!(
-                    "{name}: expected (tokens, width) = {} or (batch, tokens, width) = {} for {}, got {}",
-                    show_shape(&[count, width]),
-                    show_shape(&[extent.batch, count, width]),
-                    patch.tokens.group.name(),
-                    show_shape(shape)
+                return Err(Error::Shape(problem!(
+                    name;
+                    expected "(tokens, width) = {} or (batch, tokens, width) = {} for {}",
+                    show_shape(&[count, width]), show_shape(&[extent.batch, count, width]), patch.tokens.group.name();
+                    got "{}", show_shape(shape)
                 )));
             }
         };

@@ -4,7 +4,7 @@ use super::extent::Extent;
 use super::groups::{Group, Tokens, check_indices};
 use super::intervention::Intervention;
 use crate::config::HeadConfig;
-use crate::error::{Error, Result, show_shape};
+use crate::error::{Error, Result, problem, show_shape};
 
 /// That cuts and biases fit the call, and that each of them acts somewhere.
 ///
@@ -21,34 +21,39 @@ pub(super) fn check(intervention: &Intervention, extent: &Extent<'_>) -> Result<
             continue;
         };
         if indices.is_empty() {
-            return Err(Error::Input(format!(
-                "{name}: expected at least one index, got an empty list"
+            return Err(Error::Input(problem!(
+                name; expected "at least one index"; got "an empty list"
             )));
         }
         check_indices(name, indices, count)?;
     }
     for (reader, source) in &intervention.cut {
         if reader.group == Group::Vl {
-            return Err(Error::Input(
-                "cut: vl is read, it does not read; expected a reader among state, future, action".to_owned(),
-            ));
+            return Err(Error::Input(problem!(
+                "cut"; "vl is read, it does not read; expected a reader among state, future, action"
+            )));
         }
         for tokens in [reader, source] {
             check_not_empty("cut", tokens, groups.check("cut", tokens)?)?;
         }
-        let edge = format!("cut: {} reads {}", reader.group.name(), source.group.name());
-        check_acts(&edge, source.group, intervention.blocks.as_deref(), config)?;
+        let edge = format!("{} reads {}", reader.group.name(), source.group.name());
+        check_acts("cut", &edge, source.group, intervention.blocks.as_deref(), config)?;
     }
     for (tokens, bias) in &intervention.key_bias {
         let count = groups.check("key_bias", tokens)?;
         check_not_empty("key_bias", tokens, count)?;
-        let keys = format!("key_bias: {} is read", tokens.group.name());
-        check_acts(&keys, tokens.group, intervention.blocks.as_deref(), config)?;
+        let keys = format!("{} is read", tokens.group.name());
+        check_acts(
+            "key_bias",
+            &keys,
+            tokens.group,
+            intervention.blocks.as_deref(),
+            config,
+        )?;
         if !bias.shape().is_empty() && bias.shape() != [count] {
-            return Err(Error::Shape(format!(
-                "key_bias: expected a number or ({count},) for {}, got {}",
-                tokens.group.name(),
-                show_shape(bias.shape())
+            return Err(Error::Shape(problem!(
+                "key_bias"; expected "a number or ({count},) for {}", tokens.group.name();
+                got "{}", show_shape(bias.shape())
             )));
         }
         if let Some(bad) = bias
@@ -56,8 +61,8 @@ pub(super) fn check(intervention: &Intervention, extent: &Extent<'_>) -> Result<
             .iter()
             .find(|value| value.is_nan() || **value == f32::INFINITY)
         {
-            return Err(Error::Input(format!(
-                "key_bias: expected numbers below infinity, got {bad}"
+            return Err(Error::Input(problem!(
+                "key_bias"; expected "numbers below infinity"; got "{bad}"
             )));
         }
     }
@@ -70,30 +75,31 @@ pub(super) fn check_not_empty(name: &str, tokens: &Tokens, count: usize) -> Resu
         return Ok(());
     }
     Err(Error::Input(match tokens.indices {
-        None => format!(
-            "{name}: expected tokens, but this call has no {} tokens",
-            tokens.group.name()
-        ),
-        Some(_) => format!(
-            "{name}: expected at least one {} token, got an empty list",
-            tokens.group.name()
-        ),
+        None => problem!(name; "expected tokens, but this call has no {} tokens", tokens.group.name()),
+        Some(_) => problem!(name; expected "at least one {} token", tokens.group.name(); got "an empty list"),
     }))
 }
 
 /// That keys of `group` are read in some of `blocks`. `edge` says what is changed.
-fn check_acts(edge: &str, group: Group, blocks: Option<&[usize]>, config: &HeadConfig) -> Result<()> {
+fn check_acts(
+    argument: &str,
+    edge: &str,
+    group: Group,
+    blocks: Option<&[usize]>,
+    config: &HeadConfig,
+) -> Result<()> {
     let is_of_vl = group == Group::Vl;
     let has_edge = |block: &usize| config.is_cross(*block) == is_of_vl;
     let kind = if is_of_vl { "cross" } else { "self" };
     let existing: Vec<usize> = (0..config.num_layers).filter(has_edge).collect();
     if existing.is_empty() {
-        return Err(Error::Input(format!(
-            "{edge} in {kind}-attention blocks only, and this head has none"
+        return Err(Error::Input(problem!(
+            argument; "{edge} in {kind}-attention blocks only, and this head has none"
         )));
     }
     match blocks {
-        Some(blocks) if !blocks.iter().any(has_edge) => Err(Error::Input(format!(
+        Some(blocks) if !blocks.iter().any(has_edge) => Err(Error::Input(problem!(
+            argument;
             "{edge} in {kind}-attention blocks only, which are {existing:?}; expected blocks with at least one of them, got {blocks:?}"
         ))),
         _ => Ok(()),

@@ -3,7 +3,7 @@
 use super::groups::Groups;
 use super::intervention::Intervention;
 use crate::config::HeadConfig;
-use crate::error::{Error, Result, show_shape};
+use crate::error::{Error, Result, problem, show_shape};
 
 /// The sizes of one call.
 #[derive(Clone, Copy)]
@@ -57,14 +57,14 @@ fn replaced_future_tokens(interventions: &[Intervention], width: usize) -> Resul
         return Ok(None);
     };
     if given.next().is_some() {
-        return Err(Error::Input(
-            "future_tokens: expected at most one intervention that replaces them, got several".to_owned(),
-        ));
+        return Err(Error::Input(problem!(
+            "future_tokens"; expected "at most one intervention that replaces them"; got "several"
+        )));
     }
     if tokens.shape().len() != 2 || tokens.shape()[1] != width {
-        return Err(Error::Shape(format!(
-            "future_tokens: expected (tokens, width) with width {width}, got {}",
-            show_shape(tokens.shape())
+        return Err(Error::Shape(problem!(
+            "future_tokens"; expected "(tokens, width) with width {width}";
+            got "{}", show_shape(tokens.shape())
         )));
     }
     Ok(Some(tokens.view().check_finite("future_tokens")?.data()))

@@ -2,7 +2,7 @@
 
 use std::ops::Range;
 
-use crate::error::{Error, Result};
+use crate::error::{Error, Problem, Result, problem};
 
 /// A group of tokens.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -27,7 +27,7 @@ impl Group {
         [Self::State, Self::Future, Self::Action, Self::Vl]
             .into_iter()
             .find(|group| group.name() == name)
-            .ok_or_else(|| Error::Input(format!("group: expected state, future, action or vl, got {name}")))
+            .ok_or_else(|| Error::Input(Problem::expected("group", "state, future, action or vl", name)))
     }
 
     /// Its name.
@@ -102,10 +102,8 @@ impl Groups {
         };
         match indices.iter().find(|index| **index >= count) {
             None => Ok(indices.len()),
-            Some(index) => Err(Error::Input(format!(
-                "{name}: {} token {index}, expected {}",
-                tokens.group.name(),
-                span(count)
+            Some(index) => Err(Error::Input(problem!(
+                name; "{} token {index}, expected {}", tokens.group.name(), span(count)
             ))),
         }
     }
@@ -115,10 +113,7 @@ impl Groups {
 pub(crate) fn check_indices(name: &str, indices: &[usize], count: usize) -> Result<()> {
     match indices.iter().find(|index| **index >= count) {
         None => Ok(()),
-        Some(index) => Err(Error::Input(format!(
-            "{name}: expected {}, got {index}",
-            span(count)
-        ))),
+        Some(index) => Err(Error::Input(Problem::expected(name, span(count), index))),
     }
 }
 

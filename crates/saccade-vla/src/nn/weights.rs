@@ -11,7 +11,7 @@ use saccade_vla_kernels::{Matrix, PackedLinear, WeightRef, quantize_rows};
 use crate::alloc::{collected, filled, product};
 use crate::array::{first_not_finite, unravel};
 use crate::engine::Engine;
-use crate::error::{Error, Result, show_shape};
+use crate::error::{Error, Result, problem, show_shape};
 use crate::ops::{check_interrupted, packing_error};
 use crate::precision::Role;
 
@@ -399,10 +399,9 @@ fn check_finite(request: &Request, elements: &Elements) -> Result<()> {
     let spec = &request.spec;
     let first = request.slices.as_ref().map_or(0, |slices| slices.start);
     let slice: usize = spec.shape[1..].iter().product();
-    Err(Error::Checkpoint(format!(
-        "{}: expected finite weights, got {value} at index {}",
-        spec.name,
-        show_shape(&unravel(first * slice + position, &spec.shape))
+    Err(Error::Checkpoint(problem!(
+        &spec.name; expected "finite weights";
+        got "{value} at index {}", show_shape(&unravel(first * slice + position, &spec.shape))
     )))
 }
 

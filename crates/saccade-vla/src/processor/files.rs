@@ -8,7 +8,7 @@ use serde_json::{Value, json};
 use super::options::{asks_for_nothing, is_argument, is_read};
 use super::settings::{LEROBOT_CROP, LEROBOT_TARGET, Preprocessing};
 use crate::config::{Object, Version};
-use crate::error::{Error, Result};
+use crate::error::{Error, Result, problem};
 
 const PROCESSOR: &str = "processor_config.json";
 const PIPELINE: &str = "policy_preprocessor.json";
@@ -239,15 +239,16 @@ fn check_keys(path: &Path, owner: &str, config: &Object, is_known: &dyn Fn(&str)
     if unknown.is_empty() {
         return Ok(());
     }
-    Err(Error::Input(format!(
-        "source: {}: {owner}: {}: expected none: its release has no such option",
-        path.display(),
-        unknown.join(", ")
+    Err(Error::Input(problem!(
+        "source"; "{}: {owner}: {}: expected none: its release has no such option",
+        path.display(), unknown.join(", ")
     )))
 }
 
 fn refused<T>(path: &Path, what: &str) -> Result<T> {
-    Err(Error::Checkpoint(format!("source: {}: {what}", path.display())))
+    Err(Error::Checkpoint(problem!(
+        "source"; "{}: {what}", path.display()
+    )))
 }
 
 /// The keys of an object; none of anything else.
@@ -269,13 +270,12 @@ pub(super) fn read_object(what: &'static str, path: &Path) -> Result<Option<Obje
     let text = read_text(what, path)?;
     match serde_json::from_str(&text) {
         Ok(Value::Object(keys)) => Ok(Some(keys)),
-        Ok(_) => Err(Error::Checkpoint(format!(
-            "{what}: {}: expected a JSON object",
-            path.display()
+        Ok(_) => Err(Error::Checkpoint(problem!(
+            what; "{}: expected a JSON object", path.display()
         ))),
         Err(source) => Err(Error::Json {
             what: format!("{what}: {}", path.display()),
-            source,
+            source: source.into(),
         }),
     }
 }

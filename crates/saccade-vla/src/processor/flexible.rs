@@ -8,7 +8,7 @@ use super::settings::{Flexible, Geometry};
 use crate::alloc::{filled, product};
 use crate::array::OwnedArray;
 use crate::config::Version;
-use crate::error::{Error, Result};
+use crate::error::{Error, Result, problem};
 use crate::ops::check_interrupted;
 
 /// A frame longer than this on one side, by this factor, is refused by the released processors of N1.6 and N1.7.
@@ -60,8 +60,8 @@ pub(super) fn flexible_view(
 fn check_ratio(name: &str, height: usize, width: usize) -> Result<()> {
     let (short, long) = (height.min(width), height.max(width));
     if long > short.saturating_mul(MAX_RATIO) {
-        return Err(Error::Input(format!(
-            "{name}: expected sides that differ by a factor of at most {MAX_RATIO}, got {height} x {width}"
+        return Err(Error::Input(problem!(
+            name; expected "sides that differ by a factor of at most {MAX_RATIO}"; got "{height} x {width}"
         )));
     }
     Ok(())
@@ -72,8 +72,8 @@ fn check_area(name: &str, frame: &Bytes<'_>, height: usize, width: usize) -> Res
     let most = MAX_AREA.max(frame.height * frame.width);
     match height.checked_mul(width) {
         Some(area) if area <= most => Ok(()),
-        _ => Err(Error::Input(format!(
-            "{name}: expected a frame that is less elongated than {} x {}, which becomes {height} x {width}",
+        _ => Err(Error::Input(problem!(
+            name; "expected a frame that is less elongated than {} x {}, which becomes {height} x {width}",
             frame.height, frame.width
         ))),
     }

@@ -7,7 +7,7 @@ use saccade_vla_kernels::Image;
 use super::settings::{Preprocessing, Settings};
 use crate::alloc::{collected, filled};
 use crate::array::{Array, OwnedArray, first_not_finite};
-use crate::error::{Error, Result, show_shape};
+use crate::error::{Error, Result, problem, show_shape};
 use crate::ops::refused;
 
 pub(super) const CHANNELS: usize = 3;
@@ -71,8 +71,8 @@ pub(super) fn read<'a>(settings: &Settings, name: &str, frame: Frame<'a>) -> Res
         Frame::F64(array) => array.shape(),
     };
     if !takes_lerobot && !matches!(frame, Frame::U8(_)) {
-        return Err(Error::Input(format!(
-            "{name}: expected bytes (uint8): floating point frames are lerobot's"
+        return Err(Error::Input(problem!(
+            name; "expected bytes (uint8): floating point frames are lerobot's"
         )));
     }
     let expected = match takes_lerobot {
@@ -80,9 +80,8 @@ pub(super) fn read<'a>(settings: &Settings, name: &str, frame: Frame<'a>) -> Res
         false => "(height, width, 3)",
     };
     let wrong = || {
-        Err(Error::Shape(format!(
-            "{name}: expected an RGB frame {expected} of at least one pixel, got {}",
-            show_shape(shape)
+        Err(Error::Shape(problem!(
+            name; expected "an RGB frame {expected} of at least one pixel"; got "{}", show_shape(shape)
         )))
     };
     let (height, width, is_planar) = match *shape {
@@ -120,8 +119,8 @@ pub(super) fn read<'a>(settings: &Settings, name: &str, frame: Frame<'a>) -> Res
 fn check_finite(name: &str, bad: Option<usize>) -> Result<()> {
     match bad {
         None => Ok(()),
-        Some(position) => Err(Error::Input(format!(
-            "{name}: expected finite values, got one that is not at position {position}"
+        Some(position) => Err(Error::Input(problem!(
+            name; expected "finite values"; got "one that is not at position {position}"
         ))),
     }
 }

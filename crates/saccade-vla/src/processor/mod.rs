@@ -18,7 +18,7 @@ use saccade_vla_kernels::Isa;
 use crate::alloc::{filled, product, reserve};
 use crate::array::OwnedArray;
 use crate::config::Version;
-use crate::error::{Error, Result};
+use crate::error::{Error, Problem, Result, problem};
 use prompt::{SpecialIds, prompt};
 use settings::{Settings, Sizes};
 use tokenizer::check_length;
@@ -82,8 +82,9 @@ impl Processor {
     /// without the version's special tokens; [`Error::Isa`] for an unknown instruction set in the environment.
     pub fn new(version: &str, tokenizer: Tokenizer, options: &ProcessorOptions<'_>) -> Result<Self> {
         let version = Version::named(version).filter(|version| *version != Version::N1);
-        let version = version
-            .ok_or_else(|| Error::Input("version: expected \"n1.5\", \"n1.6\" or \"n1.7\"".to_owned()))?;
+        let version = version.ok_or_else(|| {
+            Error::Input(Problem::new("version", "expected \"n1.5\", \"n1.6\" or \"n1.7\""))
+        })?;
         let settings = Settings::new(version, options)?;
         let ids = SpecialIds::find(&tokenizer, version)?;
         Ok(Self {
@@ -151,9 +152,8 @@ impl Processor {
         let text = |&id: &i64| {
             let found = u32::try_from(id).ok().and_then(|id| self.tokenizer.text_of(id));
             found.ok_or_else(|| {
-                Error::Input(format!(
-                    "ids: expected those of the tokenizer's {} tokens, got {id}",
-                    self.num_tokens()
+                Error::Input(problem!(
+                    "ids"; expected "those of the tokenizer's {} tokens", self.num_tokens(); got "{id}"
                 ))
             })
         };
@@ -195,17 +195,17 @@ impl Processor {
     /// The order in which the views of each observation stand.
     fn orders(&self, observations: &[Observation<'_>]) -> Result<Vec<Vec<usize>>> {
         let Some(first) = observations.first() else {
-            return Err(Error::Input(
-                "frames: expected at least one observation, got none".to_owned(),
-            ));
+            return Err(Error::Input(problem!(
+                "frames"; expected "at least one observation"; got "none"
+            )));
         };
         let mut orders: Vec<Vec<usize>> = Vec::with_capacity(observations.len());
         for observation in observations {
             let views = &observation.views;
             if views.is_empty() {
-                return Err(Error::Input(
-                    "frames: expected at least one view, got none".to_owned(),
-                ));
+                return Err(Error::Input(problem!(
+                    "frames"; expected "at least one view"; got "none"
+                )));
             }
             let mut order: Vec<usize> = (0..views.len()).collect();
             if self.settings.preprocessing == Preprocessing::Lerobot && !observation.is_ordered {
@@ -214,10 +214,9 @@ impl Processor {
             if let Some(expected) = orders.first() {
                 let (expected, got) = (names(first, expected), names(observation, &order));
                 if views.len() != first.views.len() || expected != got {
-                    return Err(Error::Input(format!(
-                        "frames: expected the same views in every observation, got {} and {}",
-                        show_views(first, expected),
-                        show_views(observation, got)
+                    return Err(Error::Input(problem!(
+                        "frames"; expected "the same views in every observation";
+                        got "{} and {}", show_views(first, expected), show_views(observation, got)
                     )));
                 }
             }
@@ -236,9 +235,8 @@ impl Processor {
             .iter()
             .fold(0_usize, |sum, tokens| sum.saturating_add(*tokens));
         if expected > most {
-            return Err(Error::Input(format!(
-                "frames: expected at most {most} image tokens, got {expected} in {} views",
-                views.len()
+            return Err(Error::Input(problem!(
+                "frames"; expected "at most {most} image tokens"; got "{expected} in {} views", views.len()
             )));
         }
         check_length("instruction", observation.instruction.unwrap_or_default())?;
@@ -251,15 +249,15 @@ impl Processor {
         let ids = self.tokenizer.ids("instruction", &text)?;
         let found = ids.iter().filter(|id| **id == self.ids.image).count();
         if found != expected {
-            return Err(Error::Input(format!(
-                "instruction: expected no token that stands for an image, got {} of them",
-                found.saturating_sub(expected)
+            return Err(Error::Input(problem!(
+                "instruction"; expected "no token that stands for an image";
+                got "{} of them", found.saturating_sub(expected)
             )));
         }
         if ids.len() > most {
-            return Err(Error::Input(format!(
-                "instruction: expected a prompt of at most {most} tokens, got {} with its {expected} image tokens",
-                ids.len()
+            return Err(Error::Input(problem!(
+                "instruction"; expected "a prompt of at most {most} tokens";
+                got "{} with its {expected} image tokens", ids.len()
             )));
         }
         Ok(ids)

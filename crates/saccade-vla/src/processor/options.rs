@@ -3,7 +3,7 @@
 use serde_json::Value;
 
 use crate::config::{Object, Version};
-use crate::error::{Error, Result};
+use crate::error::{Error, Problem, Result, problem};
 
 /// Larger sides, and larger areas, are hostile: the greatest area that is published is this one.
 pub(super) const MAX_SIDE: usize = 1 << 12;
@@ -192,11 +192,11 @@ impl Options {
         let mut keys = match text.map(serde_json::from_str).transpose() {
             Ok(None) => Object::new(),
             Ok(Some(Value::Object(keys))) => keys,
-            Ok(Some(_)) => return Err(Error::Input("options: expected a JSON object".to_owned())),
+            Ok(Some(_)) => return Err(Error::Input(Problem::new("options", "expected a JSON object"))),
             Err(source) => {
                 return Err(Error::Json {
                     what: "options".to_owned(),
-                    source,
+                    source: source.into(),
                 });
             }
         };
@@ -223,10 +223,9 @@ impl Options {
     pub(super) fn finish(mut self) -> Result<()> {
         match self.problems.len() {
             0 => Ok(()),
-            1 => Err(Error::Input(format!("options: {}", self.problems.remove(0)))),
-            _ => Err(Error::Input(format!(
-                "options:\n  {}",
-                self.problems.join("\n  ")
+            1 => Err(Error::Input(Problem::new("options", self.problems.remove(0)))),
+            _ => Err(Error::Input(problem!(
+                "options"; "\n  {}", self.problems.join("\n  ")
             ))),
         }
     }

@@ -8,7 +8,7 @@ use super::python_text::{formalized, list_of};
 use super::settings::{Preprocessing, Settings};
 use super::tokenizer::Tokenizer;
 use crate::config::Version;
-use crate::error::{Error, Result};
+use crate::error::{Error, Result, problem};
 
 /// What the released processor of N1.5 and N1.6 replaces by a frame, wherever it stands in the prompt.
 static PLACEHOLDER: LazyLock<Regex> =
@@ -76,10 +76,8 @@ impl SpecialIds {
             .collect();
         match (tokenizer.id_of(view.image), tokenizer.id_of(PADDING)) {
             (Some(image), Some(padding)) if missing.is_empty() => Ok(Self { image, padding }),
-            _ => Err(Error::Checkpoint(format!(
-                "tokenizer: the special tokens of {} are missing: {}",
-                version.title(),
-                missing.join(", ")
+            _ => Err(Error::Checkpoint(problem!(
+                "tokenizer"; "the special tokens of {} are missing: {}", version.title(), missing.join(", ")
             ))),
         }
     }
@@ -118,9 +116,8 @@ fn text(settings: &Settings, instruction: Option<&str>, plain_text: bool) -> Res
         (Preprocessing::Lerobot, None | Some("")) => "Perform the task.",
         (Preprocessing::Isaac, None) if settings.version == Version::N15 => "Perform the default behavior.",
         (Preprocessing::Isaac, None) => {
-            return Err(Error::Input(format!(
-                "instruction: expected text: Isaac-GR00T {} has no default",
-                settings.version.title()
+            return Err(Error::Input(problem!(
+                "instruction"; "expected text: Isaac-GR00T {} has no default", settings.version.title()
             )));
         }
         (_, Some(text)) => text,
@@ -140,9 +137,9 @@ fn text(settings: &Settings, instruction: Option<&str>, plain_text: bool) -> Res
     if settings.version != Version::N17
         && let Some(found) = PLACEHOLDER.find(&text)
     {
-        return Err(Error::Input(format!(
-            "instruction: expected none of the placeholders that stand for a frame, got {}",
-            found.as_str()
+        return Err(Error::Input(problem!(
+            "instruction"; expected "none of the placeholders that stand for a frame";
+            got "{}", found.as_str()
         )));
     }
     Ok(text)

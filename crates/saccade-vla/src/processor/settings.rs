@@ -2,7 +2,7 @@
 
 use super::options::{MAX_AREA, MAX_SIDE, Options};
 use crate::config::Version;
-use crate::error::{Error, Result};
+use crate::error::{Error, Result, problem};
 
 /// Whose code a checkpoint was trained behind: it decides how frames are resized and in which order views stand.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -32,9 +32,7 @@ impl Preprocessing {
             .into_iter()
             .find(|one| one.name() == name)
             .ok_or_else(|| {
-                Error::Input(format!(
-                    "preprocessing: expected \"lerobot\" or \"isaac\", got {name:?}"
-                ))
+                Error::Input(problem!("preprocessing"; expected "\"lerobot\" or \"isaac\""; got "{name:?}"))
             })
     }
 }

@@ -11,7 +11,7 @@ use super::settings::{PATCH_SIZE, Preprocessing, ProcessorOptions};
 use super::tokenizer::TokenizerFiles;
 use super::{Processor, Tokenizer};
 use crate::config::{CheckpointConfig, Version};
-use crate::error::{Error, Result, show_shape};
+use crate::error::{Error, Result, problem, show_shape};
 use crate::recognise::HeadCheckpoint;
 
 /// What the names of a backbone's tensors begin with: lerobot's, NVIDIA's, a backbone alone.
@@ -152,10 +152,9 @@ impl ProcessorSource {
         replaced: Option<&str>,
     ) -> Result<Processor> {
         let files = tokenizer.or(self.tokenizer.as_ref()).ok_or_else(|| {
-            Error::Checkpoint(format!(
-                "tokenizer: the checkpoint has none; needed are {} of {}",
-                self.needed_files().join(", "),
-                self.published().join(" or ")
+            Error::Checkpoint(problem!(
+                "tokenizer"; "the checkpoint has none; needed are {} of {}",
+                self.needed_files().join(", "), self.published().join(" or ")
             ))
         })?;
         let preprocessing = preprocessing.unwrap_or(self.preprocessing);
@@ -197,9 +196,9 @@ fn backbone_of(checkpoint: &Checkpoint) -> Option<(Version, &'static str)> {
 fn version_of_head(source: &Path) -> Result<Version> {
     let head = HeadCheckpoint::open(source, None)?;
     Version::named(&head.config.version).ok_or_else(|| {
-        Error::Checkpoint(format!(
-            "source: expected the backbone of GR00T N1.5, N1.6 or N1.7, got a head of {}",
-            head.config.version
+        Error::Checkpoint(problem!(
+            "source"; expected "the backbone of GR00T N1.5, N1.6 or N1.7";
+            got "a head of {}", head.config.version
         ))
     })
 }
@@ -208,10 +207,8 @@ fn version_of_head(source: &Path) -> Result<Version> {
 fn check_declared(config: &CheckpointConfig, version: Version) -> Result<()> {
     for declared in config.declared() {
         if declared.version.is_some_and(|other| other != version) {
-            return Err(Error::Checkpoint(format!(
-                "config: {}, but the tensors are those of {}",
-                declared.text,
-                version.title()
+            return Err(Error::Checkpoint(problem!(
+                "config"; "{}, but the tensors are those of {}", declared.text, version.title()
             )));
         }
     }
@@ -237,9 +234,8 @@ fn n15_sizes(
         _ => PATCH_SIZE,
     };
     let bad = |what: &str| {
-        Err(Error::Checkpoint(format!(
-            "source: {name}: expected {what}, got shape {}",
-            show_shape(positions)
+        Err(Error::Checkpoint(problem!(
+            "source"; "{name}: expected {what}, got shape {}", show_shape(positions)
         )))
     };
     let &[patches, width] = positions else {
@@ -260,8 +256,8 @@ fn n15_sizes(
     if let Some(given) = config.and_then(given_image_size)
         && given != side as u64
     {
-        return Err(Error::Checkpoint(format!(
-            "config: the image size is {given}, but {name} has {grid} x {grid} patches of {patch}"
+        return Err(Error::Checkpoint(problem!(
+            "config"; "the image size is {given}, but {name} has {grid} x {grid} patches of {patch}"
         )));
     }
     Ok((Some(side), Some(patches / taken)))

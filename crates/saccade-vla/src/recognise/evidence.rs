@@ -5,7 +5,7 @@ use serde_json::Value;
 use super::layout::{CheckpointLayout, Contents, Evidence};
 use super::sizes::{DECODERS, FUTURE_TOKENS};
 use crate::config::{Feature, Version};
-use crate::error::{Error, Result};
+use crate::error::{Error, Result, problem};
 
 /// The one version that all evidence fits, and the evidence, a sentence each.
 ///
@@ -26,9 +26,8 @@ pub(super) fn recognise_version(
         [one] => one,
         [] => {
             let sentences: Vec<String> = sentences.collect();
-            return Err(Error::Checkpoint(format!(
-                "source: what is found belongs to different versions of GR00T:\n  {}",
-                sentences.join("\n  ")
+            return Err(Error::Checkpoint(problem!(
+                "source"; "what is found belongs to different versions of GR00T:\n  {}", sentences.join("\n  ")
             )));
         }
         // Nothing says which: a head alone, whose config names no model.
@@ -116,8 +115,8 @@ fn evidence(contents: &Contents<'_>, layout: &dyn CheckpointLayout) -> Result<Ve
 fn names_of_models(contents: &Contents<'_>) -> Result<Vec<Evidence>> {
     let unknown = |what: &str| {
         let names = Version::model_types();
-        Err(Error::Checkpoint(format!(
-            "config: {what}, expected one of {names}"
+        Err(Error::Checkpoint(problem!(
+            "config"; "{what}, expected one of {names}"
         )))
     };
     let mut found = Vec::new();

@@ -9,7 +9,7 @@ use serde_json::{Map, Value, json};
 use super::layout::{CheckpointLayout, Contents, Evidence};
 use super::sizes::{self, BLOCKS, FUTURE_TOKENS, HeadShapes, add_decoders, proved};
 use crate::config::{CheckpointConfig, Feature, OWN_KEY, Object, Version};
-use crate::error::{Error, Result};
+use crate::error::{Error, Result, problem};
 
 /// lerobot's: everything under `_groot_model.`, the policy's `config.json`.
 pub(super) struct Lerobot;
@@ -43,8 +43,8 @@ impl CheckpointLayout for Lerobot {
             _ if config.is_nested() => Ok(false),
             None => Ok(false),
             Some(Value::String(policy)) if policy == POLICY => Ok(true),
-            Some(policy) => Err(Error::Checkpoint(format!(
-                "config: type is {policy}: lerobot's config of another policy, expected \"{POLICY}\""
+            Some(policy) => Err(Error::Checkpoint(problem!(
+                "config"; "type is {policy}: lerobot's config of another policy, expected \"{POLICY}\""
             ))),
         }
     }
@@ -165,11 +165,11 @@ fn from_tensors(policy: &Object, version: Version, tensors: &HeadShapes<'_>) -> 
     if problems.is_empty() {
         return Ok(head);
     }
-    Err(Error::Checkpoint(format!(
-        "source: config.json (lerobot's, GR00T {}) and tensors do not make a head; the head's own config can be given as \
+    Err(Error::Checkpoint(problem!(
+        "source";
+        "config.json (lerobot's, GR00T {}) and tensors do not make a head; the head's own config can be given as \
          `config`:\n  {}",
-        version.title(),
-        problems.join("\n  ")
+        version.title(), problems.join("\n  ")
     )))
 }
 
@@ -271,13 +271,12 @@ fn own_config(directory: &Path) -> Result<Option<Value>> {
     }
     let own = serde_json::from_str(&read_text("source", &path)?).map_err(|source| Error::Json {
         what: format!("source: {}", path.display()),
-        source,
+        source: source.into(),
     })?;
     match own {
         Value::Object(_) => Ok(Some(own)),
-        _ => Err(Error::Checkpoint(format!(
-            "source: {}: expected a JSON object",
-            path.display()
+        _ => Err(Error::Checkpoint(problem!(
+            "source"; "{}: expected a JSON object", path.display()
         ))),
     }
 }

@@ -15,7 +15,7 @@ use saccade_vla_checkpoint::{Checkpoint, read_text};
 use serde_json::Value;
 
 use crate::config::{CheckpointConfig, HeadConfig};
-use crate::error::{Error, Result};
+use crate::error::{Error, Result, problem};
 use evidence::recognise_version;
 use layout::{CheckpointLayout, Contents};
 use lerobot::{Fork, Lerobot};
@@ -85,10 +85,9 @@ impl HeadCheckpoint {
         // What is wrong with the config alone comes first.
         let head = HeadConfig::from_json(&config_json)?;
         if !problems.is_empty() {
-            return Err(Error::Checkpoint(format!(
-                "source: config and tensors disagree (GR00T {}):\n  {}",
-                version.title(),
-                problems.join("\n  ")
+            return Err(Error::Checkpoint(problem!(
+                "source"; "config and tensors disagree (GR00T {}):\n  {}",
+                version.title(), problems.join("\n  ")
             )));
         }
         Ok(Self {
@@ -183,16 +182,17 @@ fn head_prefix(checkpoint: &Checkpoint) -> Result<&'static str> {
         [] => {
             let is_backbone = |name: &str| BACKBONES.iter().any(|prefix| name.starts_with(prefix));
             match checkpoint.names().next() {
-                Some(first) if checkpoint.names().all(is_backbone) => Err(Error::Checkpoint(format!(
-                    "source: there is no action head among the {} tensors, such as {first}: this is a backbone alone",
+                Some(first) if checkpoint.names().all(is_backbone) => Err(Error::Checkpoint(problem!(
+                    "source";
+                    "there is no action head among the {} tensors, such as {first}: this is a backbone alone",
                     checkpoint.names().count()
                 ))),
                 _ => Ok(""),
             }
         }
         [prefix] => Ok(prefix),
-        [first, second, ..] => Err(Error::Checkpoint(format!(
-            "source: two heads in one checkpoint, under `{first}` and `{second}`"
+        [first, second, ..] => Err(Error::Checkpoint(problem!(
+            "source"; "two heads in one checkpoint, under `{first}` and `{second}`"
         ))),
     }
 }
@@ -210,8 +210,8 @@ pub(crate) fn kept_embodiments(checkpoint: &Checkpoint) -> Result<Option<Vec<i64
     };
     let ids: std::result::Result<_, _> = listed.split(',').map(str::parse).collect();
     ids.map(Some).map_err(|_| {
-        Error::Checkpoint(format!(
-            "source: {KEPT_EMBODIMENTS} in the metadata is `{listed}`, expected numbers with commas between them"
+        Error::Checkpoint(problem!(
+            "source"; "{KEPT_EMBODIMENTS} in the metadata is `{listed}`, expected numbers with commas between them"
         ))
     })
 }

@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use saccade_vla_checkpoint::spec::SCALE_SUFFIX;
 use saccade_vla_checkpoint::{Checkpoint, CheckpointWriter, Dtype, PlannedTensor};
 
-use crate::error::{Error, Result};
+use crate::error::{Error, Result, problem};
 use crate::head::embodiments::chosen_embodiments;
 use crate::head::plan::tensor_specs;
 use crate::head::state_dropout::STATE_DROPOUT;
@@ -285,9 +285,8 @@ impl Rounding {
                 continue;
             }
             if !rounded.is_finite() {
-                return Err(Error::Checkpoint(format!(
-                    "source: {name} holds {value}, more than {:?} can: expected another dtype",
-                    to.dtype()
+                return Err(Error::Checkpoint(problem!(
+                    "source"; "{name} holds {value}, more than {:?} can: expected another dtype", to.dtype()
                 )));
             }
             let error = (rounded - value).abs();
@@ -311,8 +310,8 @@ impl Rounding {
         let is_finite = self.values.iter().all(|value| value.is_finite());
         delta.add(first, &mut self.values);
         match self.values.iter().find(|value| !to.round(**value).is_finite()) {
-            Some(bad) if is_finite => Err(Error::Checkpoint(format!(
-                "adapter: {name} would be {bad}, more than {:?} can hold: expected another dtype",
+            Some(bad) if is_finite => Err(Error::Checkpoint(problem!(
+                "adapter"; "{name} would be {bad}, more than {:?} can hold: expected another dtype",
                 to.dtype()
             ))),
             _ => Ok(()),

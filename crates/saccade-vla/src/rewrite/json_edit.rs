@@ -4,7 +4,7 @@ use std::ops::Range;
 
 use serde_json::value::RawValue;
 
-use crate::error::{Error, Result};
+use crate::error::{Error, Result, problem};
 use saccade_vla_checkpoint::UniqueMap;
 
 /// A value in a config.
@@ -17,7 +17,7 @@ pub(crate) struct Found<'a> {
 
 /// All values of the objects in `value`, which is at `path`.
 pub(crate) fn find<'a>(path: &str, value: &'a RawValue, found: &mut Vec<Found<'a>>) -> Result<()> {
-    let broken = |error: serde_json::Error| Error::Checkpoint(format!("config: {path}: {error}"));
+    let broken = |error: serde_json::Error| Error::Checkpoint(problem!("config"; "{path}: {error}"));
     match value.get().as_bytes().first() {
         Some(b'{') => {
             let object: UniqueMap<&RawValue> = serde_json::from_str(value.get()).map_err(broken)?;

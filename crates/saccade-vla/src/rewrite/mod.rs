@@ -13,7 +13,7 @@ use std::path::{Path, PathBuf};
 use saccade_vla_checkpoint::{Checkpoint, CheckpointWriter, Companions, PlannedTensor};
 
 use crate::config::HeadConfig;
-use crate::error::{Error, Result};
+use crate::error::{Error, Problem, Result, problem};
 use crate::ops::check_interrupted;
 use adapter::{is_beside, open_base};
 
@@ -184,7 +184,9 @@ impl SourceCheckpoint {
             write(name, &mut writer)?;
             done = u64::saturating_add(done, self.checkpoint.nbytes(name)?);
             if !progress(done, total) {
-                return Err(Error::Input("stopped; nothing was written".to_owned()));
+                return Err(Error::Input(Problem::from(
+                    "stopped; nothing was written".to_owned(),
+                )));
             }
         }
         Ok(Written {
@@ -204,9 +206,8 @@ fn check_apart<'a>(source: &'a Path, files: impl Iterator<Item = &'a Path>, out:
     };
     let is_inside = |path: &Path| path.canonicalize().is_ok_and(|from| from.starts_with(&to));
     if std::iter::once(source).chain(files).any(is_inside) {
-        return Err(Error::Input(format!(
-            "out: {} holds the source, expected another directory",
-            out.display()
+        return Err(Error::Input(problem!(
+            "out"; "{} holds the source, expected another directory", out.display()
         )));
     }
     Ok(())

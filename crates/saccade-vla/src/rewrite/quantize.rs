@@ -9,7 +9,7 @@ use saccade_vla_kernels::quantize_rows;
 
 use crate::alloc::filled;
 use crate::backbone::BackboneCheckpoint;
-use crate::error::{Error, Result};
+use crate::error::{Error, Result, problem};
 use crate::head::plan::tensor_specs;
 use crate::nn::weights::weight_view;
 use crate::ops::check_interrupted;
@@ -72,8 +72,8 @@ pub fn quantize(
         .iter()
         .find(|name| matches!(source.checkpoint.dtype(name), Ok(Dtype::I8)))
     {
-        return Err(Error::Checkpoint(format!(
-            "source: it is quantised already: {name} is I8, expected F32, BF16 or F16"
+        return Err(Error::Checkpoint(problem!(
+            "source"; "it is quantised already: {name} is I8, expected F32, BF16 or F16"
         )));
     }
     let mut planned = Vec::new();
@@ -165,7 +165,7 @@ fn backbone_of(
     match BackboneCheckpoint::open(&source.path, Some(&source.given_config)) {
         Ok(backbone) => Ok(Ok(Some(backbone))),
         // Not a backbone that saccade loads, such as one of a program's own.
-        Err(Error::Checkpoint(why)) => Ok(Err(why)),
+        Err(Error::Checkpoint(why)) => Ok(Err(why.to_string())),
         Err(error) => Err(error),
     }
 }
@@ -191,8 +191,8 @@ fn write_quantized(
         &mut scales,
     );
     if let Some(row) = scales.iter().position(|scale| !(127.0 * scale).is_finite()) {
-        return Err(Error::Checkpoint(format!(
-            "source: {name} holds NaN or infinity in row {row}, expected finite weights"
+        return Err(Error::Checkpoint(problem!(
+            "source"; "{name} holds NaN or infinity in row {row}, expected finite weights"
         )));
     }
     writer.tensor(name, bytemuck::cast_slice(&values))?;
@@ -210,8 +210,8 @@ fn copy_finite(checkpoint: &Checkpoint, name: &str, writer: &mut CheckpointWrite
         check_interrupted()?;
         float.read(bytes, &mut values);
         if let Some(bad) = values.iter().find(|value| !value.is_finite()) {
-            return Err(Error::Checkpoint(format!(
-                "source: {name} holds {bad}, expected finite weights"
+            return Err(Error::Checkpoint(problem!(
+                "source"; "{name} holds {bad}, expected finite weights"
             )));
         }
         Ok(writer.tensor(name, bytes)?)

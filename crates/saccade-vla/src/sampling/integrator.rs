@@ -3,7 +3,7 @@
 use saccade_vla_kernels::Activations;
 
 use crate::alloc::sized;
-use crate::error::{Error, Result};
+use crate::error::{Error, Result, problem};
 
 /// The scheme of one integration step of length `dt`, from `x` at flow time `t`, along the velocity `v`.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -34,8 +34,8 @@ impl Integrator {
         match name {
             "euler" => Ok(Self::Euler),
             "midpoint" => Ok(Self::Midpoint),
-            _ => Err(Error::Input(format!(
-                "integrator: expected euler or midpoint, got {name}"
+            _ => Err(Error::Input(problem!(
+                "integrator"; expected "euler or midpoint"; got "{name}"
             ))),
         }
     }

@@ -3,7 +3,7 @@
 use crate::alloc::{collected, filled, reserve};
 use crate::backbone::config::{BackboneConfig, VisionConfig};
 use crate::backbone::inputs::{Prompt, ViewPixels};
-use crate::error::{Error, Result};
+use crate::error::{Error, Result, problem};
 use crate::nn::rope::{Turn, frequencies, one_axis};
 
 /// The base of the frequencies of a vision tower's rotary positions.
@@ -118,9 +118,10 @@ pub(crate) fn token_positions(
         let tokens = place..place + rows * columns;
         let is_whole = |token| prompt.attended[token] && prompt.ids[token] == config.image_token_id as i64;
         if tokens.end > count || !tokens.clone().all(is_whole) {
-            return Err(Error::Input(format!(
-                "input_ids: expected the {} tokens of a view one after the other and attended, got others from token {place} on",
-                tokens.len()
+            return Err(Error::Input(problem!(
+                "input_ids";
+                expected "the {} tokens of a view one after the other and attended", tokens.len();
+                got "others from token {place} on"
             )));
         }
         for (index, token) in tokens.clone().enumerate() {

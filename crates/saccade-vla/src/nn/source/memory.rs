@@ -9,10 +9,10 @@ use half::{bf16, f16};
 use safetensors::Dtype;
 
 use crate::alloc::reserve;
-use crate::error::{Error, Result, show_shape};
+use crate::error::{Error, Result, problem, show_shape};
 use crate::nn::weights::{Request, Source, Tensor};
 use crate::ops::check_interrupted;
-use saccade_vla_checkpoint::spec::{self, Problem};
+use saccade_vla_checkpoint::spec::{self, TensorProblem};
 use saccade_vla_checkpoint::{Elements, TensorSpec};
 
 /// The elements of a tensor that someone else holds, row-major.
@@ -102,10 +102,8 @@ impl<'a> TensorView<'a> {
             .iter()
             .try_fold(1_usize, |count, &size| count.checked_mul(size));
         if expected != Some(elements.len()) {
-            return Err(Error::Shape(format!(
-                "tensors: {} does not fit {} elements",
-                show_shape(shape),
-                elements.len()
+            return Err(Error::Shape(problem!(
+                "tensors"; "{} does not fit {} elements", show_shape(shape), elements.len()
             )));
         }
         Ok(Self {
@@ -128,7 +126,7 @@ pub(crate) fn problems(
     tensors: &TensorViews<'_>,
     expected: &[TensorSpec],
     is_unused: impl Fn(&str, &[usize]) -> bool,
-) -> Vec<Problem> {
+) -> Vec<TensorProblem> {
     let describe = |name: &str| {
         let tensor = tensors.get(name)?;
         Some((tensor.elements.dtype(), tensor.shape.as_slice()))
@@ -153,7 +151,7 @@ impl<'a> MemorySource<'a> {
 
     fn tensor_view(&self, name: &str) -> Result<&TensorView<'a>> {
         let tensor = self.tensors.get(name);
-        tensor.ok_or_else(|| Error::Checkpoint(format!("tensors: {name} is missing")))
+        tensor.ok_or_else(|| Error::Checkpoint(problem!("tensors"; "{name} is missing")))
     }
 }
 
@@ -172,10 +170,8 @@ impl Source for MemorySource<'_> {
                 elements.range(range).to_elements(None)?
             }
             (Some(slices), _) => {
-                return Err(Error::Checkpoint(format!(
-                    "tensors: {} has shape {} and no slices {slices:?}",
-                    spec.name,
-                    show_shape(shape)
+                return Err(Error::Checkpoint(problem!(
+                    "tensors"; "{} has shape {} and no slices {slices:?}", spec.name, show_shape(shape)
                 )));
             }
         };

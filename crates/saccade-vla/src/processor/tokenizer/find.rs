@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 
 use saccade_vla_checkpoint::read_text;
 
-use crate::error::{Error, Result};
+use crate::error::{Error, Result, problem};
 
 const JSON: &str = "tokenizer.json";
 const VOCAB: &str = "vocab.json";
@@ -45,9 +45,8 @@ impl TokenizerFiles {
             return Ok(Self::Json(path.to_owned()));
         }
         Self::in_folder(path).ok_or_else(|| {
-            Error::Checkpoint(format!(
-                "tokenizer: {} holds neither {JSON} nor {VOCAB} and {MERGES}",
-                path.display()
+            Error::Checkpoint(problem!(
+                "tokenizer"; "{} holds neither {JSON} nor {VOCAB} and {MERGES}", path.display()
             ))
         })
     }

@@ -97,7 +97,7 @@ impl<'de> Deserialize<'de> for Merge {
 pub(super) fn parse(text: &str) -> Result<Parts> {
     let file: File = serde_json::from_str(text).map_err(|source| Error::Json {
         what: "tokenizer".to_owned(),
-        source,
+        source: source.into(),
     })?;
     let mut problems = Problems::default();
     check_kind(&file, &mut problems);

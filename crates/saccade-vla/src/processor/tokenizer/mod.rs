@@ -17,7 +17,7 @@ use tokenizers::{
     AddedToken, Decoder, DecoderWrapper, PostProcessorWrapper, SplitDelimiterBehavior, TokenizerImpl,
 };
 
-use crate::error::{Error, Result};
+use crate::error::{Error, Problem, Result, problem};
 use find::FilesText;
 use parts::{PATTERN, Parts};
 
@@ -33,8 +33,8 @@ const MAX_TEXT_BYTES: usize = 1 << 18;
 pub(super) fn check_length(name: &str, text: &str) -> Result<()> {
     match text.len() {
         ..=MAX_TEXT_BYTES => Ok(()),
-        len => Err(Error::Input(format!(
-            "{name}: expected at most {MAX_TEXT_BYTES} bytes of text, got {len}"
+        len => Err(Error::Input(problem!(
+            name; expected "at most {MAX_TEXT_BYTES} bytes of text"; got "{len}"
         ))),
     }
 }
@@ -99,13 +99,13 @@ impl Tokenizer {
         // Added tokens are in the vocabulary too, so that they keep the ids of the file: the crate numbers others in their order.
         vocab.extend(added.iter().map(|token| (token.content.clone(), token.id)));
         let bpe = BPE::builder().vocab_and_merges(vocab, merges).build();
-        let bpe = bpe.map_err(|problem| Error::Checkpoint(format!("tokenizer: merges: {problem}")))?;
+        let bpe = bpe.map_err(|problem| Error::Checkpoint(problem!("tokenizer"; "merges: {problem}")))?;
         let split = Split::new(
             SplitPattern::Regex(PATTERN.to_owned()),
             SplitDelimiterBehavior::Isolated,
             false,
         );
-        let split = split.map_err(|problem| Error::Checkpoint(format!("tokenizer: {problem}")))?;
+        let split = split.map_err(|problem| Error::Checkpoint(Problem::new("tokenizer", problem)))?;
         let mut inner = Inner::new(bpe);
         inner.with_normalizer(Some(NFC));
         inner.with_pre_tokenizer(Some(Sequence::new(vec![
@@ -141,7 +141,7 @@ impl Tokenizer {
     /// [`Error::Input`] for text that the crate refuses.
     pub(super) fn ids(&self, name: &str, text: &str) -> Result<Vec<u32>> {
         let encoding = self.inner.encode_fast(text, false);
-        let encoding = encoding.map_err(|problem| Error::Input(format!("{name}: {problem}")))?;
+        let encoding = encoding.map_err(|problem| Error::Input(Problem::new(name, problem)))?;
         Ok(encoding.get_ids().to_vec())
     }
 

@@ -106,7 +106,7 @@ pub(super) fn parse(
 fn from_json<'a, T: Deserialize<'a>>(file: &str, text: &'a str) -> Result<T> {
     serde_json::from_str(text).map_err(|source| Error::Json {
         what: format!("tokenizer: {file}"),
-        source,
+        source: source.into(),
     })
 }
 

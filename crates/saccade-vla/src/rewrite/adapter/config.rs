@@ -7,7 +7,7 @@ use saccade_vla_checkpoint::{ADAPTER_CONFIG, read_text};
 use serde_json::Value;
 
 use crate::config::Object;
-use crate::error::{Error, Result};
+use crate::error::{Error, Result, problem};
 
 /// Keys without effect on the merged weights: where the base is, how it was trained, how the adapter was drawn.
 const WITHOUT_EFFECT: [&str; 13] = [
@@ -101,7 +101,7 @@ impl AdapterConfig {
             Err(source) => {
                 return Err(Error::Json {
                     what: format!("adapter: {}", path.display()),
-                    source,
+                    source: source.into(),
                 });
             }
         };
@@ -296,5 +296,5 @@ fn differs(config: &Object, key: &str, expected: &str) -> Error {
 }
 
 fn bad(problem: &str) -> Error {
-    Error::Checkpoint(format!("adapter: {ADAPTER_CONFIG}: {problem}"))
+    Error::Checkpoint(problem!("adapter"; "{ADAPTER_CONFIG}: {problem}"))
 }

@@ -14,7 +14,7 @@ use saccade_vla_checkpoint::{
 };
 use serde_json::value::RawValue;
 
-use crate::error::{Error, Result};
+use crate::error::{Error, Result, problem};
 use crate::recognise::HeadCheckpoint;
 use crate::rewrite::float::Float;
 use crate::rewrite::json_edit::{find, span};
@@ -86,7 +86,7 @@ fn own_config(adapter: &Path) -> Result<Option<String>> {
     let text = read_text("adapter", &path)?;
     let whole: &RawValue = serde_json::from_str(&text).map_err(|source| Error::Json {
         what: format!("adapter: {}", path.display()),
-        source,
+        source: source.into(),
     })?;
     let mut values = Vec::new();
     find("", whole, &mut values)?;
@@ -108,9 +108,9 @@ impl Adapter {
     /// the base, and for a base in int8.
     pub(crate) fn open(directory: &Path, base: &Checkpoint) -> Result<Self> {
         if !directory.is_dir() {
-            return Err(Error::Input(format!(
-                "adapter: expected a directory with {ADAPTER_CONFIG} and {ADAPTER_WEIGHTS}, got {}",
-                directory.display()
+            return Err(Error::Input(problem!(
+                "adapter"; expected "a directory with {ADAPTER_CONFIG} and {ADAPTER_WEIGHTS}";
+                got "{}", directory.display()
             )));
         }
         let config = AdapterConfig::read(directory)?;
@@ -119,8 +119,9 @@ impl Adapter {
             .names()
             .find(|name| matches!(base.dtype(name), Ok(Dtype::I8)))
         {
-            return Err(Error::Checkpoint(format!(
-                "source: {name} is I8: expected weights that are not quantised; merge the adapter first, then quantise"
+            return Err(Error::Checkpoint(problem!(
+                "source";
+                "{name} is I8: expected weights that are not quantised; merge the adapter first, then quantise"
             )));
         }
         let mut changes = BTreeMap::new();
@@ -148,10 +149,8 @@ impl Adapter {
         if more > 0 {
             problems.push(format!("and {more} more"));
         }
-        Err(Error::Checkpoint(format!(
-            "adapter: {} does not fit the base:\n  {}",
-            directory.display(),
-            problems.join("\n  ")
+        Err(Error::Checkpoint(problem!(
+            "adapter"; "{} does not fit the base:\n  {}", directory.display(), problems.join("\n  ")
         )))
     }
 
@@ -182,8 +181,9 @@ impl Adapter {
 fn weights_of(directory: &Path) -> Result<PathBuf> {
     let weights = directory.join(ADAPTER_WEIGHTS);
     if !weights.exists() && directory.join("adapter_model.bin").exists() {
-        return Err(Error::Checkpoint(format!(
-            "adapter: {} holds adapter_model.bin, expected {ADAPTER_WEIGHTS}: save it again with PEFT's save_pretrained, which writes that",
+        return Err(Error::Checkpoint(problem!(
+            "adapter";
+            "{} holds adapter_model.bin, expected {ADAPTER_WEIGHTS}: save it again with PEFT's save_pretrained, which writes that",
             directory.display()
         )));
     }

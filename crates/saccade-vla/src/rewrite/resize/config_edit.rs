@@ -6,7 +6,7 @@ use serde_json::Value;
 use serde_json::value::RawValue;
 
 use crate::config::{Feature, HEAD_KEY, HeadConfig, OWN_KEY, Version};
-use crate::error::{Error, Result};
+use crate::error::{Error, Problem, Result, problem};
 use crate::rewrite::json_edit::{Found, entry, find, span};
 
 /// Merging compares every token with every other, and a chunk takes time in proportion to their number.
@@ -54,34 +54,40 @@ struct HeadObject {
 /// [`Error::Checkpoint`] for a version without future tokens, a head that has none, and numbers that contradict each other;
 /// [`Error::Input`] for a count out of range.
 pub(super) fn config_edit(config: &HeadConfig, given: &str, count: usize) -> Result<ConfigEdit> {
-    let bad = |problem: String| Err(Error::Checkpoint(problem));
+    let bad = |argument, problem: String| Err(Error::Checkpoint(Problem::new(argument, problem)));
     let before = config.num_future_tokens;
     let version = Version::named(&config.version);
     if !version.is_some_and(|version| version.has(Feature::FutureTokens)) {
-        return bad(format!(
-            "source: GR00T {} has no future tokens, so there is no number of them to change",
-            config.version.to_uppercase()
-        ));
+        return bad(
+            "source",
+            format!(
+                "GR00T {} has no future tokens, so there is no number of them to change",
+                config.version.to_uppercase()
+            ),
+        );
     }
     if before == 0 {
         return bad(
-            "source: it has no future tokens: there is nothing to copy, and new ones would have to be trained".to_owned(),
+            "source",
+            "it has no future tokens: there is nothing to copy, and new ones would have to be trained"
+                .to_owned(),
         );
     }
     if count > MAX_TOKENS {
-        return Err(Error::Input(format!(
-            "num_future_tokens: expected at most {MAX_TOKENS}, got {count}"
+        return Err(Error::Input(problem!(
+            "num_future_tokens"; expected "at most {MAX_TOKENS}"; got "{count}"
         )));
     }
     if before > MAX_TOKENS {
-        return bad(format!(
-            "source: it has {before} future tokens, expected at most {MAX_TOKENS}"
-        ));
+        return bad(
+            "source",
+            format!("it has {before} future tokens, expected at most {MAX_TOKENS}"),
+        );
     }
     let mut found = Vec::new();
     let whole: &RawValue = serde_json::from_str(given).map_err(|source| Error::Json {
         what: "config".to_owned(),
-        source,
+        source: source.into(),
     })?;
     find("", whole, &mut found)?;
     let counts: Vec<&Found<'_>> = found.iter().filter(|place| place.key == COUNT_KEY).collect();
@@ -91,10 +97,10 @@ pub(super) fn config_edit(config: &HeadConfig, given: &str, count: usize) -> Res
         .map(|place| format!("{} is {}", place.path, place.value.get()))
         .collect();
     if !others.is_empty() {
-        return bad(format!(
-            "config: {}, but the head has {before} future tokens",
-            others.join("; ")
-        ));
+        return bad(
+            "config",
+            format!("{}, but the head has {before} future tokens", others.join("; ")),
+        );
     }
     let head = found
         .iter()

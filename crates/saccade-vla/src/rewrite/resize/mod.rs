@@ -12,7 +12,7 @@ use std::path::Path;
 
 use saccade_vla_checkpoint::{OWN_CONFIG, reserve};
 
-use crate::error::{Error, Result};
+use crate::error::{Error, Result, problem};
 use crate::recognise::sizes::FUTURE_TOKENS;
 use crate::rewrite::float::Float;
 use crate::rewrite::{RewriteOptions, SourceCheckpoint, Written};
@@ -93,8 +93,8 @@ pub fn resize(
     let name = format!("{}{FUTURE_TOKENS}", source.prefix);
     let tokens = source.checkpoint.read(&name)?.into_f32()?;
     if let Some(bad) = tokens.iter().find(|value| !value.is_finite()) {
-        return Err(Error::Checkpoint(format!(
-            "source: {name} holds {bad}, expected finite numbers"
+        return Err(Error::Checkpoint(problem!(
+            "source"; "{name} holds {bad}, expected finite numbers"
         )));
     }
     let no_bias = || vec![0.0; config.num_future_tokens];

@@ -1,6 +1,6 @@
 //! Noise on the copies of future tokens, so that training can tell them apart.
 
-use crate::error::{Error, Result};
+use crate::error::{Error, Result, problem};
 
 /// Adds noise to `resized`, rows that begin with the `before` rows of `tokens`, from row `before` on; returns the noise's root mean square,
 /// which is `amount` times that of `tokens`.
@@ -16,8 +16,8 @@ pub(super) fn perturb(
     seed: u64,
 ) -> Result<f64> {
     if !(amount.is_finite() && amount >= 0.0) {
-        return Err(Error::Input(format!(
-            "perturbation: expected a finite number of at least 0, got {amount}"
+        return Err(Error::Input(problem!(
+            "perturbation"; expected "a finite number of at least 0"; got "{amount}"
         )));
     }
     if amount == 0.0 {
@@ -26,8 +26,8 @@ pub(super) fn perturb(
     let width = tokens.len() / before;
     let count = resized.len() / width;
     if count <= before {
-        return Err(Error::Input(format!(
-            "perturbation: copies are perturbed, and of {before} future tokens {count} have none"
+        return Err(Error::Input(problem!(
+            "perturbation"; "copies are perturbed, and of {before} future tokens {count} have none"
         )));
     }
     let squares: f64 = tokens.iter().map(|&value| f64::from(value).powi(2)).sum();
@@ -45,8 +45,9 @@ pub(super) fn perturb(
         .iter()
         .find(|value| value.is_nan() || f64::from(value.abs()) > bound)
     {
-        return Err(Error::Input(format!(
-            "perturbation: {amount:?} gives a token with an element of {large:e}; a layer norm of {width} float32 elements overflows above {bound:.1e}"
+        return Err(Error::Input(problem!(
+            "perturbation";
+            "{amount:?} gives a token with an element of {large:e}; a layer norm of {width} float32 elements overflows above {bound:.1e}"
         )));
     }
     Ok((added / ((count - before) * width) as f64).sqrt())
