@@ -4,7 +4,7 @@ use std::marker::PhantomData;
 
 use crate::isa::Isa;
 use crate::simd::math::{Activation, Exp, GeluErf, GeluTanh, Relu, Silu};
-use crate::simd::{Kernel, Simd, Vector};
+use crate::simd::{Kernel, Simd};
 
 /// An activation over a slice, in place.
 struct Map<'a, A> {
@@ -16,18 +16,13 @@ impl<A: Activation> Kernel for Map<'_, A> {
     type Output = ();
 
     #[inline(always)]
-    unsafe fn run<S: Simd>(self, _: S) {
-        let mut chunks = self.x.chunks_exact_mut(S::Vector::LANES);
-        for chunk in &mut chunks {
-            // SAFETY: a chunk has LANES elements; the caller has the instruction set.
-            unsafe { A::of(S::Vector::load(chunk.as_ptr())).store(chunk.as_mut_ptr()) }
+    fn run<S: Simd>(self, simd: S) {
+        let mut chunks = self.x.chunks_exact_mut(S::LANES);
+        for x in &mut chunks {
+            simd.store(A::of(simd, simd.load(x)), x);
         }
         let rest = chunks.into_remainder();
-        // SAFETY: as many lanes as there are elements.
-        unsafe {
-            let last = S::Vector::load_partial(rest.as_ptr(), rest.len());
-            A::of(last).store_partial(rest.as_mut_ptr(), rest.len());
-        }
+        simd.store_rest(A::of(simd, simd.load_rest(rest)), rest);
     }
 }
 

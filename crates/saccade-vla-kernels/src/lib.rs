@@ -29,6 +29,7 @@ pub mod peak;
 mod pool;
 mod rope;
 mod rows;
+#[allow(dead_code, reason = "kernels move to its tokens one by one")]
 mod simd;
 mod threads;
 mod tiles;

@@ -155,7 +155,7 @@ impl Kernel for Read<'_> {
     type Output = usize;
 
     #[inline(always)]
-    unsafe fn run<S: Simd>(self, _: S) -> usize {
+    fn run<S: Simd>(self, _: S) -> usize {
         const VECTORS: usize = 8;
         let lanes = S::Vector::LANES;
         let turn = VECTORS * lanes;

@@ -102,7 +102,7 @@ impl Kernel for RotationRows<'_> {
     type Output = ();
 
     #[inline(always)]
-    unsafe fn run<S: Simd>(self, _: S) {
+    fn run<S: Simd>(self, _: S) {
         let call = self.call;
         for row in self.rows {
             let (cos, sin) = (call.cos.row(row), call.sin.row(row));

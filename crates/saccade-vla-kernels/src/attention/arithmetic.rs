@@ -4,7 +4,7 @@ use std::marker::PhantomData;
 
 use half::bf16;
 
-use crate::simd::math::{EXP2, EXP2_FOR_BF16, exp_below_zero};
+use crate::simd::old::math::{EXP2, EXP2_FOR_BF16, exp_below_zero};
 use crate::simd::{Dots, Simd, Vector};
 
 /// How keys and values are held, and what multiplies them. A word of them is met by one or two broadcast factors, words too, that are made

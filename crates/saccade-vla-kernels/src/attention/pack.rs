@@ -38,7 +38,7 @@ impl Kernel for WordHead<'_> {
     type Output = bool;
 
     #[inline(always)]
-    unsafe fn run<S: Simd>(self, _: S) -> bool {
+    fn run<S: Simd>(self, _: S) -> bool {
         // SAFETY: called within `Simd::run`.
         unsafe { self.0.pack::<S, S::Vector, WordLayout>() }
     }
@@ -49,7 +49,7 @@ impl Kernel for PairHead<'_> {
     const DOTS: Option<Dot> = Some(Dot::Bf16);
 
     #[inline(always)]
-    unsafe fn run<S: Simd>(self, _: S) -> bool {
+    fn run<S: Simd>(self, _: S) -> bool {
         // SAFETY: called within `Simd::run`.
         unsafe { self.0.pack::<S, S::Vector, PairLayout>() }
     }

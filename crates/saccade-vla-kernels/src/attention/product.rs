@@ -113,7 +113,7 @@ impl<H: Stored> Kernel for FloatProduct<'_, H> {
     type Output = ();
 
     #[inline(always)]
-    unsafe fn run<S: Simd>(self, _: S) {
+    fn run<S: Simd>(self, _: S) {
         // SAFETY: the promise to `Multiply::multiply`.
         unsafe { self.product.run::<S, Float32<H>>() }
     }
@@ -125,7 +125,7 @@ impl Kernel for PairProduct<'_> {
     type Output = ();
 
     #[inline(always)]
-    unsafe fn run<S: Simd>(self, _: S) {
+    fn run<S: Simd>(self, _: S) {
         // SAFETY: the promise to `Multiply::multiply`.
         unsafe { self.0.run::<S, Pairs>() }
     }

@@ -58,7 +58,7 @@ impl Kernel for FloatTile<'_> {
     type Output = ();
 
     #[inline(always)]
-    unsafe fn run<S: Simd>(self, simd: S) {
+    fn run<S: Simd>(self, simd: S) {
         // SAFETY: called within `Simd::run`; keys and values are float32.
         unsafe {
             self.0
@@ -72,7 +72,7 @@ impl Kernel for Bf16Tile<'_> {
     const DOTS: Option<Dot> = Some(Dot::Bf16);
 
     #[inline(always)]
-    unsafe fn run<S: Simd>(self, simd: S) {
+    fn run<S: Simd>(self, simd: S) {
         // SAFETY: called within `Simd::run`; keys and values are pairs of bfloat16.
         unsafe {
             if S::Dots::HAS_BF16 {
@@ -103,7 +103,7 @@ impl<U: TileUnit> Kernel for BesideUnit<'_, U> {
     type Output = ();
 
     #[inline(always)]
-    unsafe fn run<S: Simd>(self, simd: S) {
+    fn run<S: Simd>(self, simd: S) {
         // SAFETY: no other session is open; called within `Simd::run`; keys and values are pairs of bfloat16 in whole steps.
         unsafe {
             let mut session = Session::new(self.unit);

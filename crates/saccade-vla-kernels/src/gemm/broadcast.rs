@@ -136,7 +136,7 @@ impl Kernel for Rounding<'_> {
     type Output = ();
 
     #[inline(always)]
-    unsafe fn run<S: Simd>(self, _: S) {
+    fn run<S: Simd>(self, _: S) {
         let (source, width) = (self.source, self.source.in_features);
         for row in self.rows {
             // SAFETY: the contract of `Gemm::convert`: rows are in the source, and have room in whole vectors.
@@ -159,7 +159,7 @@ impl Kernel for FloatRun<'_> {
     type Output = ();
 
     #[inline(always)]
-    unsafe fn run<S: Simd>(self, _: S) {
+    fn run<S: Simd>(self, _: S) {
         // SAFETY: the contract of `Gemm::multiply`.
         unsafe { multiply::<S, FloatStep>(self.0) }
     }
@@ -204,7 +204,7 @@ impl Kernel for WideningRun<'_> {
     type Output = ();
 
     #[inline(always)]
-    unsafe fn run<S: Simd>(self, _: S) {
+    fn run<S: Simd>(self, _: S) {
         // SAFETY: the contract of `Gemm::multiply`.
         unsafe { multiply::<S, WideningStep>(self.0) }
     }

@@ -126,7 +126,7 @@ macro_rules! kernels {
             type Output = usize;
 
             #[inline(always)]
-            unsafe fn run<S: Simd>(self, _: S) -> usize {
+            fn run<S: Simd>(self, _: S) -> usize {
                 // SAFETY: kernels are called within `Simd::run`.
                 unsafe { all_chains::<S, Self>() }
             }

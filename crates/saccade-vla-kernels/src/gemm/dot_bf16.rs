@@ -59,7 +59,7 @@ impl Kernel for Narrowing<'_> {
     type Output = ();
 
     #[inline(always)]
-    unsafe fn run<S: Simd>(self, _: S) {
+    fn run<S: Simd>(self, _: S) {
         let (source, width) = (self.source, self.source.in_features);
         for row in self.rows {
             // SAFETY: the contract of `Gemm::convert`: rows are in the source, and have room in whole vectors.
@@ -82,7 +82,7 @@ impl Kernel for PairRun<'_> {
     type Output = ();
 
     #[inline(always)]
-    unsafe fn run<S: Simd>(self, _: S) {
+    fn run<S: Simd>(self, _: S) {
         // SAFETY: the contract of `Gemm::multiply`.
         unsafe { multiply::<S, PairStep>(self.0) }
     }

@@ -59,7 +59,7 @@ impl Kernel for QuadRun<'_> {
     type Output = ();
 
     #[inline(always)]
-    unsafe fn run<S: Simd>(self, _: S) {
+    fn run<S: Simd>(self, _: S) {
         // SAFETY: the contract of `Gemm::multiply`.
         unsafe { multiply::<S, QuadStep>(self.0) }
     }
@@ -136,7 +136,7 @@ impl Kernel for Quantizing<'_> {
     type Output = ();
 
     #[inline(always)]
-    unsafe fn run<S: Simd>(self, _: S) {
+    fn run<S: Simd>(self, _: S) {
         let source = self.source;
         for row in self.rows {
             // SAFETY: the contract of `Gemm::convert`: rows are in the source, and have room in whole vectors.

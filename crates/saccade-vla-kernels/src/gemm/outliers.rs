@@ -105,7 +105,7 @@ impl Kernel for MultiplyOutliers<'_> {
     type Output = ();
 
     #[inline(always)]
-    unsafe fn run<S: Simd>(self, _: S) {
+    fn run<S: Simd>(self, _: S) {
         let rows = self.outliers.iter().zip(self.sums.chunks_exact_mut(self.columns));
         for (outliers, sums) in rows.filter(|(outliers, _)| !outliers.is_empty()) {
             sums.fill(MaybeUninit::new(0.0));

@@ -184,7 +184,7 @@ impl<S: Sums> Kernel for AlongWidth<'_, S> {
     type Output = ();
 
     #[inline(always)]
-    unsafe fn run<I: Simd>(self, _: I) {
+    fn run<I: Simd>(self, _: I) {
         let Self {
             sums,
             image,
@@ -248,7 +248,7 @@ impl<S: Sums> Kernel for AlongHeight<'_, S> {
     type Output = ();
 
     #[inline(always)]
-    unsafe fn run<I: Simd>(self, _: I) {
+    fn run<I: Simd>(self, _: I) {
         let (sums, inner) = (self.sums, self.inner);
         for index in 0..sums.num_outputs() {
             sums.sum(

@@ -6,7 +6,7 @@ use std::ops::Range;
 
 use crate::gemm::Quantized;
 use crate::gemm::outliers::Outliers;
-use crate::simd::math::{self, Activation};
+use crate::simd::old::math::{self, Activation};
 use crate::simd::{Kernel, Simd, Vector, load, store};
 
 /// What is done with `x W^T + bias`, element by element.
@@ -66,7 +66,7 @@ impl Kernel for &Finish<'_> {
     type Output = ();
 
     #[inline(always)]
-    unsafe fn run<S: Simd>(self, _: S) {
+    fn run<S: Simd>(self, _: S) {
         // SAFETY: the views of the call have the rows and columns; the sums of their columns have been written, in whole vectors.
         unsafe {
             if self.int8.scales.is_empty() {

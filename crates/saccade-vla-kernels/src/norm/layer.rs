@@ -90,7 +90,7 @@ impl Kernel for LayerNormRows<'_> {
     type Output = ();
 
     #[inline(always)]
-    unsafe fn run<S: Simd>(self, _: S) {
+    fn run<S: Simd>(self, _: S) {
         for row in self.rows {
             // SAFETY: rows are within the views; the caller has the instruction set.
             unsafe {

@@ -106,7 +106,7 @@ impl Kernel for RmsNormRows<'_> {
     type Output = ();
 
     #[inline(always)]
-    unsafe fn run<S: Simd>(self, _: S) {
+    fn run<S: Simd>(self, _: S) {
         let call = self.call;
         for row in self.rows {
             for head in (0..call.width).step_by(call.weight.len()) {

@@ -60,7 +60,7 @@ impl Kernel for Narrowing<'_> {
     type Output = ();
 
     #[inline(always)]
-    unsafe fn run<S: Simd>(self, _: S) {
+    fn run<S: Simd>(self, _: S) {
         let (source, width) = (self.source, self.source.in_features);
         let stride = odd_lines(width, 2);
         for row in self.rows {
@@ -85,7 +85,7 @@ impl Kernel for BfmmlaRun<'_> {
     type Output = ();
 
     #[inline(always)]
-    unsafe fn run<S: Simd>(self, _: S) {
+    fn run<S: Simd>(self, _: S) {
         // SAFETY: the contract of `Gemm::multiply`.
         unsafe { multiply::<S, BfmmlaStep, VECTORS>(self.0) }
     }

@@ -41,7 +41,7 @@ impl<L: Link> Kernel for Chains<L> {
     type Output = usize;
 
     #[inline(always)]
-    unsafe fn run<S: Simd>(self, _: S) -> usize {
+    fn run<S: Simd>(self, _: S) -> usize {
         // SAFETY: kernels are called within `Simd::run`, here of an instruction set with the product's instruction.
         unsafe {
             let (a, b) = (black_box(vdupq_n_u32(0)), black_box(vdupq_n_u32(0)));

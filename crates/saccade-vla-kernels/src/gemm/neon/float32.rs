@@ -136,7 +136,7 @@ impl Kernel for FloatRun<'_> {
     type Output = ();
 
     #[inline(always)]
-    unsafe fn run<S: Simd>(self, _: S) {
+    fn run<S: Simd>(self, _: S) {
         // SAFETY: the contract of `Gemm::multiply`.
         unsafe { multiply::<S, FloatStep, VECTORS>(self.0) }
     }
@@ -149,7 +149,7 @@ impl Kernel for WideningRun<'_> {
     type Output = ();
 
     #[inline(always)]
-    unsafe fn run<S: Simd>(self, _: S) {
+    fn run<S: Simd>(self, _: S) {
         // SAFETY: the contract of `Gemm::multiply`.
         unsafe { multiply::<S, WideningStep, VECTORS>(self.0) }
     }

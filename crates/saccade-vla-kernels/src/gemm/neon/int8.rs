@@ -76,7 +76,7 @@ macro_rules! product {
             type Output = ();
 
             #[inline(always)]
-            unsafe fn run<S: Simd>(self, _: S) {
+            fn run<S: Simd>(self, _: S) {
                 // SAFETY: the contract of `Gemm::multiply`.
                 unsafe { multiply::<S, $step, { $vectors }>(self.0) }
             }

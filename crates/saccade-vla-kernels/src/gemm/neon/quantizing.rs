@@ -22,7 +22,7 @@ impl Kernel for Quantizing<'_> {
     type Output = ();
 
     #[inline(always)]
-    unsafe fn run<S: Simd>(self, _: S) {
+    fn run<S: Simd>(self, _: S) {
         let (source, width) = (self.source, self.source.in_features);
         let stride = odd_lines(width, 4);
         for row in self.rows {

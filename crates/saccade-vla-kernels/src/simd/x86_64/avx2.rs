@@ -2,300 +2,209 @@
 
 use std::arch::x86_64::*;
 
-use super::{NEAREST, simd_type};
-use crate::simd::{Dots, Kernel, NoDots, Simd, Vector};
+use super::{NEAREST, prefetch};
+use crate::simd::bits::{read, write};
+use crate::simd::{Kernel, Simd, forward, functions, token};
 
-simd_type! {
+/// A token of these vectors, with what it adds to AVX2 and FMA.
+macro_rules! avx2 {
+    ($(#[$doc:meta])* $name:ident: [$($feature:tt),*], { $($own:tt)* }) => {
+        token! {
+            $(#[$doc])*
+            $name: is_x86_feature_detected["avx2", "fma" $(, $feature)*], {
+                const LANES: usize = 8;
+                const TILE_ROWS: usize = 6;
+                const TILE_VECTORS: usize = 2;
+                type F32 = __m256;
+                type I32 = __m256i;
+                type Vector = __m256;
+                $($own)*
+            }
+        }
+    };
+}
+
+avx2! {
     /// AVX2 with FMA.
-    Avx2, __m256, NoDots, "avx2", "fma"
+    Avx2: [], {
+        type Dots = crate::simd::NoDots;
+        // Two products of at most 129 * 127 are less than 2^15, where `maddubs` saturates. The other ways out cost
+        // more: 7 bits in the weights lose as much (0.018 of the result instead of 0.011; this way, 0.017), 16-bit
+        // products take the time of float32.
+        const MAX_BYTE: u8 = 129;
+        forward! { fn dot_int8(sum: __m256i, x: __m256i, w: __m256i) -> __m256i = maddubs; }
+    }
 }
 
-simd_type! {
-    /// AVX2 with AVX-VNNI.
-    Avx2VexVnni, __m256, VexVnni, "avx2", "fma", "avxvnni"
+avx2! {
+    /// AVX2 with AVX-VNNI: the shorter encoding, of CPUs that may lack AVX-512.
+    Avx2VexVnni: ["avxvnni"], {
+        type Dots = crate::simd::old::avx2::VexVnni;
+        const MAX_BYTE: u8 = 255;
+        const DOT_NAME: &'static str = "vnni";
+        forward! { fn dot_int8(sum: __m256i, x: __m256i, w: __m256i) -> __m256i = _mm256_dpbusd_avx_epi32; }
+    }
 }
 
-simd_type! {
+avx2! {
     /// AVX2 with the 256-bit form of AVX512-VNNI.
-    Avx2EvexVnni, __m256, EvexVnni, "avx2", "fma", "avx512f", "avx512vl", "avx512vnni"
-}
-
-/// AVX-VNNI: the shorter encoding, of CPUs that may lack AVX-512.
-pub(crate) struct VexVnni;
-
-// SAFETY: the caller has AVX-VNNI.
-unsafe impl Dots<__m256> for VexVnni {
-    const NAME: &'static str = "vnni";
-    const MAX_BYTE: u8 = 255;
-
-    #[inline(always)]
-    unsafe fn int8(sum: __m256i, x: __m256i, w: __m256i) -> __m256i {
-        // SAFETY: the caller's promise.
-        unsafe { _mm256_dpbusd_avx_epi32(sum, x, w) }
+    Avx2EvexVnni: ["avx512f", "avx512vl", "avx512vnni"], {
+        type Dots = crate::simd::old::avx2::EvexVnni;
+        const MAX_BYTE: u8 = 255;
+        const DOT_NAME: &'static str = "vnni";
+        forward! { fn dot_int8(sum: __m256i, x: __m256i, w: __m256i) -> __m256i = _mm256_dpbusd_epi32; }
     }
 }
 
-/// AVX512-VNNI with VL, on vectors of 256 bits.
-pub(crate) struct EvexVnni;
+functions! {
+    "avx2,fma":
 
-// SAFETY: the caller has AVX512-VNNI and VL.
-unsafe impl Dots<__m256> for EvexVnni {
-    const NAME: &'static str = "vnni";
-    const MAX_BYTE: u8 = 255;
+    fn splat(x: f32) -> __m256 {
+        _mm256_set1_ps(x)
+    }
 
-    #[inline(always)]
-    unsafe fn int8(sum: __m256i, x: __m256i, w: __m256i) -> __m256i {
-        // SAFETY: the caller's promise.
-        unsafe { _mm256_dpbusd_epi32(sum, x, w) }
+    fn add(a: __m256, b: __m256) -> __m256 {
+        _mm256_add_ps(a, b)
+    }
+
+    fn sub(a: __m256, b: __m256) -> __m256 {
+        _mm256_sub_ps(a, b)
+    }
+
+    fn mul(a: __m256, b: __m256) -> __m256 {
+        _mm256_mul_ps(a, b)
+    }
+
+    fn div(a: __m256, b: __m256) -> __m256 {
+        _mm256_div_ps(a, b)
+    }
+
+    fn fma(a: __m256, b: __m256, addend: __m256) -> __m256 {
+        _mm256_fmadd_ps(a, b, addend)
+    }
+
+    fn min(a: __m256, b: __m256) -> __m256 {
+        _mm256_min_ps(a, b)
+    }
+
+    fn max(a: __m256, b: __m256) -> __m256 {
+        _mm256_max_ps(a, b)
+    }
+
+    fn round(x: __m256) -> __m256 {
+        _mm256_round_ps::<NEAREST>(x)
+    }
+
+    fn scale_by_power_of_two(x: __m256, exponent: __m256) -> __m256 {
+        // In two steps, so that neither factor leaves the range of normal numbers.
+        let exponent = _mm256_cvtps_epi32(exponent);
+        let half = _mm256_srai_epi32::<1>(exponent);
+        let rest = _mm256_sub_epi32(exponent, half);
+        let bias = _mm256_set1_epi32(127);
+        let first = _mm256_castsi256_ps(_mm256_slli_epi32::<23>(_mm256_add_epi32(half, bias)));
+        let second = _mm256_castsi256_ps(_mm256_slli_epi32::<23>(_mm256_add_epi32(rest, bias)));
+        _mm256_mul_ps(_mm256_mul_ps(x, first), second)
+    }
+
+    fn low_bits_as_exponent(x: __m256) -> __m256 {
+        _mm256_castsi256_ps(_mm256_slli_epi32::<23>(_mm256_castps_si256(x)))
+    }
+
+    fn replace_where(x: __m256, probe: __m256, value: __m256) -> __m256 {
+        _mm256_blendv_ps(x, value, _mm256_cmp_ps::<_CMP_EQ_OQ>(probe, value))
+    }
+
+    fn splat_i32(x: i32) -> __m256i {
+        _mm256_set1_epi32(x)
+    }
+
+    fn add_i32(a: __m256i, b: __m256i) -> __m256i {
+        _mm256_add_epi32(a, b)
+    }
+
+    fn sub_i32(a: __m256i, b: __m256i) -> __m256i {
+        _mm256_sub_epi32(a, b)
+    }
+
+    fn mul_i32(a: __m256i, b: __m256i) -> __m256i {
+        _mm256_mullo_epi32(a, b)
+    }
+
+    fn to_f32(x: __m256i) -> __m256 {
+        _mm256_cvtepi32_ps(x)
+    }
+
+    fn low_halves(pairs: __m256i) -> __m256 {
+        _mm256_castsi256_ps(_mm256_slli_epi32::<16>(pairs))
+    }
+
+    fn high_halves(pairs: __m256i) -> __m256 {
+        _mm256_castsi256_ps(_mm256_and_si256(pairs, _mm256_set1_epi32(0xffff_0000_u32 as i32)))
+    }
+
+    fn round_to_bf16(x: __m256) -> __m256 {
+        // Half a unit of the last place is added, less one where that place is even; a NaN's payload could overflow,
+        // so it becomes the quiet one.
+        let bits = _mm256_castps_si256(x);
+        let even = _mm256_and_si256(_mm256_srli_epi32::<16>(bits), _mm256_set1_epi32(1));
+        let rounded = _mm256_add_epi32(_mm256_add_epi32(bits, _mm256_set1_epi32(0x7fff)), even);
+        let rounded = _mm256_and_si256(rounded, _mm256_set1_epi32(0xffff_0000_u32 as i32));
+        let nan = _mm256_cmp_ps::<_CMP_UNORD_Q>(x, x);
+        _mm256_blendv_ps(_mm256_castsi256_ps(rounded), _mm256_set1_ps(f32::NAN), nan)
+    }
+
+    fn maddubs(sum: __m256i, x: __m256i, w: __m256i) -> __m256i {
+        let pairs = _mm256_maddubs_epi16(x, w);
+        _mm256_add_epi32(sum, _mm256_madd_epi16(pairs, _mm256_set1_epi16(1)))
+    }
+
+    fn load_rest(from: &[f32]) -> __m256 {
+        // SAFETY: lanes beyond the slice are masked, so they are not read.
+        unsafe { _mm256_maskload_ps(from.as_ptr(), first_lanes(from.len())) }
+    }
+
+    fn store_rest(x: __m256, to: &mut [f32]) {
+        // SAFETY: lanes beyond the slice are masked, so they are not written.
+        unsafe { _mm256_maskstore_ps(to.as_mut_ptr(), first_lanes(to.len()), x) }
+    }
+
+    fn store_bf16(x: __m256, to: &mut [u16]) {
+        // Packing works within halves of the vector, which are then put in order.
+        let high = _mm256_srli_epi32::<16>(_mm256_castps_si256(round_to_bf16(x)));
+        let packed = _mm256_permute4x64_epi64::<0b1000>(_mm256_packus_epi32(high, high));
+        write(_mm256_castsi256_si128(packed), to);
+    }
+
+    fn store_bytes(x: __m256, zero: __m256i, most: __m256i, to: &mut [u8]) {
+        let integers = _mm256_add_epi32(_mm256_cvtps_epi32(x), zero);
+        let integers = _mm256_min_epi32(integers, most);
+        let low = _mm256_castsi256_si128(integers);
+        let halves = _mm_packus_epi32(low, _mm256_extracti128_si256::<1>(integers));
+        write(_mm_cvtsi128_si64(_mm_packus_epi16(halves, halves)), to);
     }
 }
 
-/// Eight lanes from element `8 - n` on have the top bit set in the first `n`.
-static FIRST_LANES: [i32; 16] = [-1, -1, -1, -1, -1, -1, -1, -1, 0, 0, 0, 0, 0, 0, 0, 0];
-
+/// A mask of the first `n` lanes.
 #[inline(always)]
-unsafe fn first_lanes(n: usize) -> __m256i {
-    debug_assert!(n <= 8);
-    // SAFETY: n <= 8, so that eight elements are left; the trait's caller has AVX2.
-    unsafe { _mm256_loadu_si256(FIRST_LANES.as_ptr().add(8 - n).cast()) }
+fn first_lanes(n: usize) -> __m256i {
+    static LANES: [i32; 16] = [-1, -1, -1, -1, -1, -1, -1, -1, 0, 0, 0, 0, 0, 0, 0, 0];
+    read(&LANES[8 - n..])
 }
 
-// SAFETY: pointers are read and written for the lanes named only; masked lanes are not accessed.
-unsafe impl Vector for __m256 {
-    const LANES: usize = 8;
-    const TILE_ROWS: usize = 6;
-    const TILE_VECTORS: usize = 2;
-    type Ints = __m256i;
-    // Two products of at most 129 * 127 are less than 2^15, where `maddubs` saturates. The other ways out cost more: 7 bits in the weights
-    // lose as much (0.018 of the result instead of 0.011; this way, 0.017), 16-bit products take the time of float32.
-    const MAX_BYTE: u8 = 129;
+/// Sum of the lanes.
+#[inline]
+#[target_feature(enable = "avx2")]
+pub(super) fn reduce_add(x: __m256) -> f32 {
+    let x = _mm_add_ps(_mm256_castps256_ps128(x), _mm256_extractf128_ps::<1>(x));
+    let x = _mm_add_ps(x, _mm_movehl_ps(x, x));
+    _mm_cvtss_f32(_mm_add_ss(x, _mm_shuffle_ps::<1>(x, x)))
+}
 
-    #[inline(always)]
-    unsafe fn splat(x: f32) -> Self {
-        // SAFETY: the trait's caller has AVX2 and FMA; so throughout.
-        unsafe { _mm256_set1_ps(x) }
-    }
-
-    #[inline(always)]
-    unsafe fn load(from: *const f32) -> Self {
-        // SAFETY: the caller gives eight elements.
-        unsafe { _mm256_loadu_ps(from) }
-    }
-
-    #[inline(always)]
-    unsafe fn store(self, to: *mut f32) {
-        // SAFETY: the caller gives eight elements.
-        unsafe { _mm256_storeu_ps(to, self) }
-    }
-
-    #[inline(always)]
-    unsafe fn load_partial(from: *const f32, n: usize) -> Self {
-        // SAFETY: the caller gives n elements; lanes beyond them are masked.
-        unsafe { _mm256_maskload_ps(from, first_lanes(n)) }
-    }
-
-    #[inline(always)]
-    unsafe fn store_partial(self, to: *mut f32, n: usize) {
-        // SAFETY: the caller gives n elements; lanes beyond them are masked.
-        unsafe { _mm256_maskstore_ps(to, first_lanes(n), self) }
-    }
-
-    #[inline(always)]
-    unsafe fn add(self, other: Self) -> Self {
-        // SAFETY: as in splat.
-        unsafe { _mm256_add_ps(self, other) }
-    }
-
-    #[inline(always)]
-    unsafe fn sub(self, other: Self) -> Self {
-        // SAFETY: as in splat.
-        unsafe { _mm256_sub_ps(self, other) }
-    }
-
-    #[inline(always)]
-    unsafe fn mul(self, other: Self) -> Self {
-        // SAFETY: as in splat.
-        unsafe { _mm256_mul_ps(self, other) }
-    }
-
-    #[inline(always)]
-    unsafe fn div(self, other: Self) -> Self {
-        // SAFETY: as in splat.
-        unsafe { _mm256_div_ps(self, other) }
-    }
-
-    #[inline(always)]
-    unsafe fn fma(self, factor: Self, addend: Self) -> Self {
-        // SAFETY: as in splat.
-        unsafe { _mm256_fmadd_ps(self, factor, addend) }
-    }
-
-    #[inline(always)]
-    unsafe fn min(self, other: Self) -> Self {
-        // SAFETY: as in splat.
-        unsafe { _mm256_min_ps(self, other) }
-    }
-
-    #[inline(always)]
-    unsafe fn max(self, other: Self) -> Self {
-        // SAFETY: as in splat.
-        unsafe { _mm256_max_ps(self, other) }
-    }
-
-    #[inline(always)]
-    unsafe fn round(self) -> Self {
-        // SAFETY: as in splat.
-        unsafe { _mm256_round_ps::<NEAREST>(self) }
-    }
-
-    #[inline(always)]
-    unsafe fn scale_by_power_of_two(self, exponent: Self) -> Self {
-        // SAFETY: as in splat. In two steps, so that neither factor leaves the range of normal numbers.
-        unsafe {
-            let exponent = _mm256_cvtps_epi32(exponent);
-            let half = _mm256_srai_epi32::<1>(exponent);
-            let rest = _mm256_sub_epi32(exponent, half);
-            let bias = _mm256_set1_epi32(127);
-            let first = _mm256_castsi256_ps(_mm256_slli_epi32::<23>(_mm256_add_epi32(half, bias)));
-            let second = _mm256_castsi256_ps(_mm256_slli_epi32::<23>(_mm256_add_epi32(rest, bias)));
-            _mm256_mul_ps(_mm256_mul_ps(self, first), second)
-        }
-    }
-
-    #[inline(always)]
-    unsafe fn low_bits_as_exponent(self) -> Self {
-        // SAFETY: as in splat.
-        unsafe { _mm256_castsi256_ps(_mm256_slli_epi32::<23>(_mm256_castps_si256(self))) }
-    }
-
-    #[inline(always)]
-    unsafe fn replace_where(self, probe: Self, value: Self) -> Self {
-        // SAFETY: as in splat.
-        unsafe { _mm256_blendv_ps(self, value, _mm256_cmp_ps::<_CMP_EQ_OQ>(probe, value)) }
-    }
-
-    #[inline(always)]
-    unsafe fn reduce_add(self) -> f32 {
-        // SAFETY: as in splat.
-        unsafe {
-            let x = _mm_add_ps(_mm256_castps256_ps128(self), _mm256_extractf128_ps::<1>(self));
-            let x = _mm_add_ps(x, _mm_movehl_ps(x, x));
-            _mm_cvtss_f32(_mm_add_ss(x, _mm_shuffle_ps::<1>(x, x)))
-        }
-    }
-
-    #[inline(always)]
-    unsafe fn reduce_max(self) -> f32 {
-        // SAFETY: as in splat.
-        unsafe {
-            let x = _mm_max_ps(_mm256_castps256_ps128(self), _mm256_extractf128_ps::<1>(self));
-            let x = _mm_max_ps(x, _mm_movehl_ps(x, x));
-            _mm_cvtss_f32(_mm_max_ss(x, _mm_shuffle_ps::<1>(x, x)))
-        }
-    }
-
-    #[inline(always)]
-    unsafe fn low_halves(pairs: __m256i) -> Self {
-        // SAFETY: as in splat.
-        unsafe { _mm256_castsi256_ps(_mm256_slli_epi32::<16>(pairs)) }
-    }
-
-    #[inline(always)]
-    unsafe fn high_halves(pairs: __m256i) -> Self {
-        // SAFETY: as in splat.
-        unsafe { _mm256_castsi256_ps(_mm256_and_si256(pairs, _mm256_set1_epi32(0xffff_0000_u32 as i32))) }
-    }
-
-    #[inline(always)]
-    unsafe fn round_to_bf16(self) -> Self {
-        // SAFETY: as in splat. Half a unit of the last place is added, less one where that place is even; a NaN's payload could
-        // overflow, so it becomes the quiet one.
-        unsafe {
-            let bits = _mm256_castps_si256(self);
-            let even = _mm256_and_si256(_mm256_srli_epi32::<16>(bits), _mm256_set1_epi32(1));
-            let rounded = _mm256_add_epi32(_mm256_add_epi32(bits, _mm256_set1_epi32(0x7fff)), even);
-            let rounded = _mm256_and_si256(rounded, _mm256_set1_epi32(0xffff_0000_u32 as i32));
-            let nan = _mm256_cmp_ps::<_CMP_UNORD_Q>(self, self);
-            _mm256_blendv_ps(_mm256_castsi256_ps(rounded), _mm256_set1_ps(f32::NAN), nan)
-        }
-    }
-
-    #[inline(always)]
-    unsafe fn store_bf16(self, to: *mut u16) {
-        // SAFETY: the caller gives room for eight elements. Packing works within halves of the vector, which are then put in order.
-        unsafe {
-            let high = _mm256_srli_epi32::<16>(_mm256_castps_si256(self.round_to_bf16()));
-            let packed = _mm256_permute4x64_epi64::<0b1000>(_mm256_packus_epi32(high, high));
-            _mm_storeu_si128(to.cast(), _mm256_castsi256_si128(packed));
-        }
-    }
-
-    #[inline(always)]
-    unsafe fn store_bytes(self, zero: __m256i, most: __m256i, to: *mut u8) {
-        // SAFETY: the caller gives room for eight elements.
-        unsafe {
-            let integers = _mm256_add_epi32(_mm256_cvtps_epi32(self), zero);
-            let integers = _mm256_min_epi32(integers, most);
-            let low = _mm256_castsi256_si128(integers);
-            let halves = _mm_packus_epi32(low, _mm256_extracti128_si256::<1>(integers));
-            _mm_storel_epi64(to.cast(), _mm_packus_epi16(halves, halves));
-        }
-    }
-
-    #[inline(always)]
-    unsafe fn splat_int(x: i32) -> __m256i {
-        // SAFETY: as in splat.
-        unsafe { _mm256_set1_epi32(x) }
-    }
-
-    #[inline(always)]
-    unsafe fn load_ints(from: *const i32) -> __m256i {
-        // SAFETY: the caller gives eight elements.
-        unsafe { _mm256_loadu_si256(from.cast()) }
-    }
-
-    #[inline(always)]
-    unsafe fn store_ints(integers: __m256i, to: *mut i32) {
-        // SAFETY: the caller gives eight elements.
-        unsafe { _mm256_storeu_si256(to.cast(), integers) }
-    }
-
-    #[inline(always)]
-    unsafe fn add_ints(a: __m256i, b: __m256i) -> __m256i {
-        // SAFETY: as in splat.
-        unsafe { _mm256_add_epi32(a, b) }
-    }
-
-    #[inline(always)]
-    unsafe fn sub_ints(a: __m256i, b: __m256i) -> __m256i {
-        // SAFETY: as in splat.
-        unsafe { _mm256_sub_epi32(a, b) }
-    }
-
-    #[inline(always)]
-    unsafe fn mul_ints(a: __m256i, b: __m256i) -> __m256i {
-        // SAFETY: as in splat.
-        unsafe { _mm256_mullo_epi32(a, b) }
-    }
-
-    #[inline(always)]
-    unsafe fn from_ints(integers: __m256i) -> Self {
-        // SAFETY: as in splat.
-        unsafe { _mm256_cvtepi32_ps(integers) }
-    }
-
-    #[inline(always)]
-    unsafe fn dot_bytes(sum: __m256i, x: __m256i, w: __m256i) -> __m256i {
-        // SAFETY: as in splat.
-        unsafe {
-            let pairs = _mm256_maddubs_epi16(x, w);
-            _mm256_add_epi32(sum, _mm256_madd_epi16(pairs, _mm256_set1_epi16(1)))
-        }
-    }
-
-    #[inline(always)]
-    unsafe fn prefetch(at: *const u8) {
-        // SAFETY: prefetching never faults, whatever the address.
-        unsafe { _mm_prefetch::<_MM_HINT_T1>(at.cast()) }
-    }
+/// Largest lane.
+#[inline]
+#[target_feature(enable = "avx2")]
+pub(super) fn reduce_max(x: __m256) -> f32 {
+    let x = _mm_max_ps(_mm256_castps256_ps128(x), _mm256_extractf128_ps::<1>(x));
+    let x = _mm_max_ps(x, _mm_movehl_ps(x, x));
+    _mm_cvtss_f32(_mm_max_ss(x, _mm_shuffle_ps::<1>(x, x)))
 }

@@ -1,0 +1,54 @@
+//! Vectors and slices as bits: reading, writing and reinterpreting them.
+
+/// Types without padding of which every bit pattern is a value.
+///
+/// # Safety
+/// Implement it for such types only.
+pub(crate) unsafe trait Bits: Copy {}
+
+// SAFETY: numbers have no padding, and every bit pattern is one.
+unsafe impl Bits for u8 {}
+// SAFETY: as of u8.
+unsafe impl Bits for u16 {}
+// SAFETY: as of u8.
+unsafe impl Bits for u32 {}
+// SAFETY: as of u8.
+unsafe impl Bits for i32 {}
+// SAFETY: as of u8.
+unsafe impl Bits for i64 {}
+// SAFETY: as of u8.
+unsafe impl Bits for f32 {}
+// SAFETY: arrays have no padding between their elements.
+unsafe impl<T: Bits, const N: usize> Bits for [T; N] {}
+
+/// The bits of `from` as another type of the same size.
+#[inline(always)]
+pub(crate) fn cast<From: Bits, To: Bits>(from: From) -> To {
+    const { assert!(size_of::<From>() == size_of::<To>()) }
+    // SAFETY: the sizes are equal, and any bits are a `To`.
+    unsafe { std::mem::transmute_copy(&from) }
+}
+
+/// A vector of the first elements of `from`.
+///
+/// # Panics
+/// If there are fewer than fit into the vector.
+#[inline(always)]
+#[track_caller]
+pub(crate) fn read<T: Bits, V: Bits>(from: &[T]) -> V {
+    let from = &from[..size_of::<V>() / size_of::<T>()];
+    // SAFETY: the slice has the size of the vector, and any bits are one. It may begin anywhere.
+    unsafe { from.as_ptr().cast::<V>().read_unaligned() }
+}
+
+/// Writes a vector to the first elements of `to`.
+///
+/// # Panics
+/// If there are fewer than the vector has.
+#[inline(always)]
+#[track_caller]
+pub(crate) fn write<T: Bits, V: Bits>(vector: V, to: &mut [T]) {
+    let to = &mut to[..size_of::<V>() / size_of::<T>()];
+    // SAFETY: the slice has the size of the vector, and any bits are elements of it. It may begin anywhere.
+    unsafe { to.as_mut_ptr().cast::<V>().write_unaligned(vector) }
+}
