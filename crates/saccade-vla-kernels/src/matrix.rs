@@ -1,10 +1,10 @@
-//! Views of matrices with any two strides.
+//! Views of matrices that are stored row-major or column-major.
 
 use std::ops::Range;
 
 use crate::rows::Rows;
 
-/// A matrix `(num_rows, num_columns)` with any strides, as weights may be stored: row-major, or the transpose of that.
+/// A matrix `(num_rows, num_columns)` as weights may be stored: row-major with any row stride, or the transpose of that.
 ///
 /// ```
 /// use saccade_vla_kernels::{Matrix, Rows};
@@ -12,24 +12,25 @@ use crate::rows::Rows;
 /// let weight = Matrix::from(Rows::new(&in_major, 2)).transpose();
 /// assert_eq!((weight.num_rows(), weight.num_columns(), weight.get(1, 2)), (2, 3, 6.0));
 /// ```
-#[derive(Clone, Copy, Debug)]
+#[derive(Debug)]
 pub struct Matrix<'a, T = f32> {
-    data: &'a [T],
-    num_rows: usize,
-    num_columns: usize,
-    row_stride: usize,
-    column_stride: usize,
+    rows: Rows<'a, T>,
+    /// Whether the rows of the matrix are the columns of `rows`.
+    is_transposed: bool,
 }
+
+impl<T> Clone for Matrix<'_, T> {
+    fn clone(&self) -> Self {
+        *self
+    }
+}
+
+impl<T> Copy for Matrix<'_, T> {}
 
 impl<'a, T> From<Rows<'a, T>> for Matrix<'a, T> {
     fn from(rows: Rows<'a, T>) -> Self {
-        Self {
-            data: rows.data(),
-            num_rows: rows.num_rows(),
-            num_columns: rows.num_columns(),
-            row_stride: rows.row_stride(),
-            column_stride: 1,
-        }
+        let is_transposed = false;
+        Self { rows, is_transposed }
     }
 }
 
@@ -47,52 +48,48 @@ impl<'a, T: Copy> Matrix<'a, T> {
     /// Number of rows: `out_features` of a weight.
     #[must_use]
     pub fn num_rows(&self) -> usize {
-        self.num_rows
+        if self.is_transposed {
+            self.rows.num_columns()
+        } else {
+            self.rows.num_rows()
+        }
     }
 
     /// Number of columns: `in_features` of a weight.
     #[must_use]
     pub fn num_columns(&self) -> usize {
-        self.num_columns
+        self.transpose().num_rows()
     }
 
     /// Rows as columns.
     #[must_use]
     pub fn transpose(self) -> Self {
+        let is_transposed = !self.is_transposed;
         Self {
-            data: self.data,
-            num_rows: self.num_columns,
-            num_columns: self.num_rows,
-            row_stride: self.column_stride,
-            column_stride: self.row_stride,
+            is_transposed,
+            ..self
         }
     }
 
     /// The rows in `rows`.
     ///
     /// # Panics
-    /// If not all of them are there.
+    /// If not all of them exist.
     #[must_use]
     #[track_caller]
     pub fn rows(self, rows: Range<usize>) -> Self {
-        assert!(
-            rows.start <= rows.end && rows.end <= self.num_rows,
-            "rows {rows:?} of {}",
-            self.num_rows
-        );
-        let empty = rows.is_empty() || self.num_columns == 0;
-        let first = if empty { 0 } else { rows.start * self.row_stride };
-        Self {
-            data: &self.data[first..],
-            num_rows: rows.len(),
-            ..self
-        }
+        let rows = if self.is_transposed {
+            self.rows.columns(rows)
+        } else {
+            self.rows.rows(rows)
+        };
+        Self { rows, ..self }
     }
 
     /// The columns in `columns`.
     ///
     /// # Panics
-    /// If not all of them are there.
+    /// If not all of them exist.
     #[must_use]
     #[track_caller]
     pub fn columns(self, columns: Range<usize>) -> Self {
@@ -108,12 +105,16 @@ impl<'a, T: Copy> Matrix<'a, T> {
     #[inline]
     pub fn get(&self, row: usize, column: usize) -> T {
         assert!(
-            row < self.num_rows && column < self.num_columns,
+            row < self.num_rows() && column < self.num_columns(),
             "element ({row}, {column}) of ({}, {})",
-            self.num_rows,
-            self.num_columns
+            self.num_rows(),
+            self.num_columns()
         );
-        self.data[row * self.row_stride + column * self.column_stride]
+        if self.is_transposed {
+            self.rows.row(column)[row]
+        } else {
+            self.rows.row(row)[column]
+        }
     }
 
     /// Row number `row` where its elements are contiguous.
@@ -123,12 +124,13 @@ impl<'a, T: Copy> Matrix<'a, T> {
     #[must_use]
     #[track_caller]
     pub fn contiguous_row(&self, row: usize) -> Option<&'a [T]> {
-        assert!(row < self.num_rows, "row {row} of {}", self.num_rows);
-        if self.num_columns == 0 {
-            return Some(&[]);
+        assert!(row < self.num_rows(), "row {row} of {}", self.num_rows());
+        match (self.is_transposed, self.num_columns()) {
+            (false, _) => Some(self.rows.row(row)),
+            (true, 0) => Some(&[]),
+            (true, 1) => Some(&self.rows.row(0)[row..=row]),
+            (true, _) => None,
         }
-        (self.column_stride == 1 || self.num_columns == 1)
-            .then(|| &self.data[row * self.row_stride..][..self.num_columns])
     }
 }
 

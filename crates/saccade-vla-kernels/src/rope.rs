@@ -1,24 +1,16 @@
 //! Rotary position embedding, with the two halves of a head as the parts of the complex numbers that are rotated.
 
-use std::ops::Range;
-
 use crate::isa::Isa;
-use crate::parts::part;
-use crate::pool::parallel_for;
+use crate::parts::parallel_rows;
 use crate::rows::{Rows, RowsMut};
-use crate::simd::{Kernel, Simd, Vector, load, store};
-
-/// Elements from which a second thread pays.
-const ELEMENTS_FOR_THREADS: usize = 1 << 16;
-
-/// Elements of one task.
-const ELEMENTS_PER_TASK: usize = 1 << 13;
+use crate::simd::{Kernel, Simd};
 
 /// Rotates each head of each row in place, as Llama and Qwen do: `(a, b)` becomes `(a cos - b sin, b cos + a sin)`.
 ///
-/// `x` is `(rows, num_heads * head_dim)`. `cos` and `sin` are `(rows, pairs)`, the angles of each row's position, for all of its heads. With
-/// `pairs = head_dim / 2`, element `i` of a head is `a` and element `pairs + i` is `b` of pair `i`; with fewer, only the first `2 * pairs`
-/// elements of a head are rotated. An element's bits depend on its pair and its angle alone.
+/// `x` is `(rows, num_heads * head_dim)`. `cos` and `sin` are `(rows, pairs)`, the angles of each row's position, for all
+/// of its heads. With `pairs = head_dim / 2`, element `i` of a head is `a` and element `pairs + i` is `b` of pair `i`;
+/// with fewer, only the first `2 * pairs` elements of a head are rotated. An element's bits depend on its pair and its
+/// angle alone.
 ///
 /// # Panics
 /// If a shape does not fit, or this CPU lacks `isa`.
@@ -33,7 +25,7 @@ const ELEMENTS_PER_TASK: usize = 1 << 13;
 pub fn rotary_embedding(
     isa: Isa,
     threads: usize,
-    mut x: RowsMut<'_>,
+    x: RowsMut<'_>,
     head_dim: usize,
     cos: Rows<'_>,
     sin: Rows<'_>,
@@ -58,80 +50,50 @@ pub fn rotary_embedding(
     if rows == 0 || width == 0 || pairs == 0 {
         return;
     }
-    let call = Rotation {
-        x_stride: x.row_stride(),
-        x: x.as_mut_ptr(),
-        width,
-        head_dim,
-        cos,
-        sin,
-    };
-    let elements = rows.saturating_mul(width);
-    let tasks = elements.div_ceil(ELEMENTS_PER_TASK).min(rows);
-    let threads = if elements < ELEMENTS_FOR_THREADS {
-        1
-    } else {
-        threads
-    };
-    parallel_for(threads, tasks, &|task| {
-        isa.run(RotationRows {
-            call: &call,
-            rows: part(rows, task, tasks),
+    parallel_rows(threads, x, &|rows, x| {
+        let (cos, sin) = (cos.rows(rows.clone()), sin.rows(rows));
+        isa.run(Rotary {
+            x,
+            head_dim,
+            cos,
+            sin,
         });
     });
 }
 
-struct Rotation<'a> {
-    x: *mut f32,
-    x_stride: usize,
-    width: usize,
+struct Rotary<'a> {
+    x: RowsMut<'a>,
     head_dim: usize,
     cos: Rows<'a>,
     sin: Rows<'a>,
 }
 
-// SAFETY: tasks read and write different rows of `x`, which is borrowed for the whole call.
-unsafe impl Sync for Rotation<'_> {}
-
-struct RotationRows<'a> {
-    call: &'a Rotation<'a>,
-    rows: Range<usize>,
-}
-
-impl Kernel for RotationRows<'_> {
+impl Kernel for Rotary<'_> {
     type Output = ();
 
     #[inline(always)]
-    fn run<S: Simd>(self, _: S) {
-        let call = self.call;
-        for row in self.rows {
-            let (cos, sin) = (call.cos.row(row), call.sin.row(row));
-            for head in (0..call.width).step_by(call.head_dim) {
-                // SAFETY: rows are within the view, heads within rows, and pairs within heads.
-                unsafe { rotate::<S::Vector>(call.x.add(row * call.x_stride + head), cos, sin) };
+    fn run<S: Simd>(mut self, simd: S) {
+        let angles = self.cos.iter().zip(self.sin.iter());
+        for (row, (cos, sin)) in self.x.iter_mut().zip(angles) {
+            for head in row.chunks_exact_mut(self.head_dim) {
+                rotate(simd, head, cos, sin);
             }
         }
     }
 }
 
-/// # Safety
-/// Called within [`Simd::run`] with the vectors of `V`. `x` points to twice as many elements as `cos` and `sin` have.
+/// Rotates the pairs of one head by their angles.
 #[inline(always)]
-unsafe fn rotate<V: Vector>(x: *mut f32, cos: &[f32], sin: &[f32]) {
-    let pairs = cos.len();
-    for i in (0..pairs).step_by(V::LANES) {
-        let lanes = V::LANES.min(pairs - i);
-        // SAFETY: the caller's promise; the last vector is partial.
-        unsafe {
-            let (first, second) = (x.add(i), x.add(pairs + i));
-            let (a, b) = (load::<V>(first, lanes), load::<V>(second, lanes));
-            let (cos, sin) = (
-                load::<V>(cos.as_ptr().add(i), lanes),
-                load::<V>(sin.as_ptr().add(i), lanes),
-            );
-            // The first product of each is rounded, the second not where there is FMA.
-            store(a.fma(cos, V::splat(0.0).sub(b.mul(sin))), first, lanes);
-            store(b.fma(cos, a.mul(sin)), second, lanes);
-        }
+fn rotate<S: Simd>(simd: S, head: &mut [f32], cos: &[f32], sin: &[f32]) {
+    let (first, second) = head[..2 * cos.len()].split_at_mut(cos.len());
+    let pairs = first.chunks_mut(S::LANES).zip(second.chunks_mut(S::LANES));
+    let angles = cos.chunks(S::LANES).zip(sin.chunks(S::LANES));
+    for ((first, second), (cos, sin)) in pairs.zip(angles) {
+        let (a, b) = (simd.load_partial(first), simd.load_partial(second));
+        let (cos, sin) = (simd.load_partial(cos), simd.load_partial(sin));
+        // The first product of each is rounded, the second not where there is FMA.
+        let minus_b_sin = simd.sub(simd.splat(0.0), simd.mul(b, sin));
+        simd.store_partial(simd.fma(a, cos, minus_b_sin), first);
+        simd.store_partial(simd.fma(b, cos, simd.mul(a, sin)), second);
     }
 }

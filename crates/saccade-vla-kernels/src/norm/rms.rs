@@ -1,19 +1,15 @@
 //! RMSNorm over rows, or over each head of a row.
 
-use std::ops::Range;
-
-use super::split;
 use crate::isa::Isa;
-use crate::parts::part;
-use crate::pool::parallel_for;
+use crate::parts::parallel_rows;
 use crate::rows::{Rows, RowsMut};
-use crate::simd::{Kernel, Simd, Vector, load, store};
+use crate::simd::{Kernel, Simd};
 
 /// `out = x / sqrt(mean(x^2) + eps) * weight`, the mean over `weight.len()` consecutive columns.
 ///
-/// `x` and `out` are `(rows, width)`. A weight of `width` elements norms whole rows; one of `head_dim` elements norms each of the
-/// `width / head_dim` heads of a row by itself, as query and key norms do. An element's bits depend on its head alone. A head of zeros gives
-/// zeros if `eps` is positive; NaN and infinity give NaN in their head.
+/// `x` and `out` are `(rows, width)`. A weight of `width` elements norms whole rows; one of `head_dim` elements norms
+/// each of the `width / head_dim` heads of a row by itself, as query and key norms do. An element's bits depend on its
+/// head alone. A head of zeros gives zeros if `eps` is positive; NaN and infinity give NaN in their head.
 ///
 /// # Panics
 /// If a shape does not fit, or this CPU lacks `isa`.
@@ -26,143 +22,107 @@ use crate::simd::{Kernel, Simd, Vector, load, store};
 /// assert!((out[1] - 30.0 / 11f32.sqrt()).abs() < 1e-5);
 /// assert_eq!(out[2..], [0.0, -10.0]);
 /// ```
-pub fn rms_norm(isa: Isa, threads: usize, x: Rows<'_>, eps: f32, weight: &[f32], mut out: RowsMut<'_>) {
+pub fn rms_norm(isa: Isa, threads: usize, x: Rows<'_>, eps: f32, weight: &[f32], out: RowsMut<'_>) {
     assert_eq!(
         (out.num_rows(), out.num_columns()),
         (x.num_rows(), x.num_columns()),
         "out: expected the shape of x"
     );
-    let call = RmsNorm {
-        x: x.as_ptr(),
-        x_stride: x.row_stride(),
-        out_stride: out.row_stride(),
-        out: out.as_mut_ptr(),
-        width: x.num_columns(),
-        eps,
-        weight,
-    };
-    run(isa, threads, x.num_rows(), &call);
+    norm(isa, threads, Some(x), eps, weight, out);
 }
 
 /// [`rms_norm`] where the results replace the rows.
 ///
 /// # Panics
 /// As [`rms_norm`].
-pub fn rms_norm_in_place(isa: Isa, threads: usize, mut x: RowsMut<'_>, eps: f32, weight: &[f32]) {
-    let to = x.as_mut_ptr();
-    let call = RmsNorm {
-        x: to,
-        x_stride: x.row_stride(),
-        out_stride: x.row_stride(),
-        out: to,
-        width: x.num_columns(),
-        eps,
-        weight,
-    };
-    run(isa, threads, x.num_rows(), &call);
+pub fn rms_norm_in_place(isa: Isa, threads: usize, x: RowsMut<'_>, eps: f32, weight: &[f32]) {
+    norm(isa, threads, None, eps, weight, x);
 }
 
-struct RmsNorm<'a> {
-    /// May be `out`.
-    x: *const f32,
-    x_stride: usize,
-    out: *mut f32,
-    out_stride: usize,
-    width: usize,
-    eps: f32,
-    /// Not empty, and its length divides `width`.
-    weight: &'a [f32],
-}
-
-// SAFETY: tasks read and write different rows; the views are borrowed for the whole call.
-unsafe impl Sync for RmsNorm<'_> {}
-
-fn run(isa: Isa, threads: usize, rows: usize, call: &RmsNorm<'_>) {
+/// Norms the rows of `x`, or those of `out` where there is no `x`.
+fn norm(isa: Isa, threads: usize, x: Option<Rows<'_>>, eps: f32, weight: &[f32], out: RowsMut<'_>) {
     isa.check();
-    if rows == 0 || call.width == 0 {
+    let width = out.num_columns();
+    if out.num_rows() == 0 || width == 0 {
         return;
     }
     assert!(
-        call.width.is_multiple_of(call.weight.len()),
-        "weight: expected {} elements, or a divisor of that, got {}",
-        call.width,
-        call.weight.len()
+        width.is_multiple_of(weight.len()),
+        "weight: expected {width} elements, or a divisor of that, got {}",
+        weight.len()
     );
-    let (threads, tasks) = split(threads, rows, call.width);
-    parallel_for(threads, tasks, &|task| {
-        isa.run(RmsNormRows {
-            call,
-            rows: part(rows, task, tasks),
-        });
+    parallel_rows(threads, out, &|rows, out| {
+        let x = x.map(|x| x.rows(rows));
+        isa.run(RmsNorm { x, eps, weight, out });
     });
 }
 
-struct RmsNormRows<'a> {
-    call: &'a RmsNorm<'a>,
-    rows: Range<usize>,
+struct RmsNorm<'a> {
+    /// None where the results replace the rows of `out`.
+    x: Option<Rows<'a>>,
+    eps: f32,
+    /// Not empty, and its length divides the number of columns.
+    weight: &'a [f32],
+    out: RowsMut<'a>,
 }
 
-impl Kernel for RmsNormRows<'_> {
+impl Kernel for RmsNorm<'_> {
     type Output = ();
 
     #[inline(always)]
-    fn run<S: Simd>(self, _: S) {
-        let call = self.call;
-        for row in self.rows {
-            for head in (0..call.width).step_by(call.weight.len()) {
-                // SAFETY: rows are within the views, heads within rows.
-                unsafe {
-                    let x = call.x.add(row * call.x_stride + head);
-                    let out = call.out.add(row * call.out_stride + head);
-                    norm_head::<S::Vector>(call, x, out);
+    fn run<S: Simd>(mut self, simd: S) {
+        let (weight, eps) = (self.weight, self.eps);
+        for (row, out) in self.out.iter_mut().enumerate() {
+            let heads = out.chunks_exact_mut(weight.len());
+            match self.x {
+                Some(x) => {
+                    for (out, x) in heads.zip(x.row(row).chunks_exact(weight.len())) {
+                        let factor = factor(simd, x, eps);
+                        let vectors = out.chunks_mut(S::LANES).zip(x.chunks(S::LANES));
+                        for ((out, x), weight) in vectors.zip(weight.chunks(S::LANES)) {
+                            let y = simd.mul(simd.load_partial(x), factor);
+                            simd.store_partial(simd.mul(y, simd.load_partial(weight)), out);
+                        }
+                    }
+                }
+                None => {
+                    for x in heads {
+                        let factor = factor(simd, x, eps);
+                        for (x, weight) in x.chunks_mut(S::LANES).zip(weight.chunks(S::LANES)) {
+                            let y = simd.mul(simd.load_partial(x), factor);
+                            simd.store_partial(simd.mul(y, simd.load_partial(weight)), x);
+                        }
+                    }
                 }
             }
         }
     }
 }
 
-/// # Safety
-/// Called within [`Simd::run`] with the vectors of `V`. `x` and `out` point to as many elements as the weight has; they are the same, or do
-/// not overlap.
+/// `1 / sqrt(mean(x^2) + eps)` in all lanes.
 #[inline(always)]
-unsafe fn norm_head<V: Vector>(call: &RmsNorm<'_>, x: *const f32, out: *mut f32) {
-    let width = call.weight.len();
-    let weight = call.weight.as_ptr();
-    // SAFETY: vectors are within the first `width` elements, the last one is partial. Each is read before it is written.
-    unsafe {
-        let mean = squares::<V>(x, width) / width as f32;
-        let factor = V::splat(1.0 / (mean + call.eps).sqrt());
-        for i in (0..width).step_by(V::LANES) {
-            let lanes = V::LANES.min(width - i);
-            let y = load::<V>(x.add(i), lanes).mul(factor);
-            store(y.mul(load(weight.add(i), lanes)), out.add(i), lanes);
-        }
-    }
+fn factor<S: Simd>(simd: S, x: &[f32], eps: f32) -> S::F32 {
+    let mean = sum_of_squares(simd, x) / x.len() as f32;
+    simd.splat(1.0 / (mean + eps).sqrt())
 }
 
 /// The sum of the squares, in four chains: short ones round less, and do not wait for each other.
-///
-/// # Safety
-/// Called within [`Simd::run`] with the vectors of `V`. `x` points to `width` elements.
 #[inline(always)]
-unsafe fn squares<V: Vector>(x: *const f32, width: usize) -> f32 {
+fn sum_of_squares<S: Simd>(simd: S, x: &[f32]) -> f32 {
     const CHAINS: usize = 4;
-    // SAFETY: the caller's promise.
-    unsafe {
-        let mut squares = [V::splat(0.0); CHAINS];
-        let vectors = width / V::LANES;
-        for i in (0..vectors / CHAINS * CHAINS).step_by(CHAINS) {
-            for (chain, square) in squares.iter_mut().enumerate() {
-                let x = V::load(x.add((i + chain) * V::LANES));
-                *square = x.fma(x, *square);
-            }
+    let mut squares = [simd.splat(0.0); CHAINS];
+    let mut groups = x.chunks_exact(CHAINS * S::LANES);
+    for group in &mut groups {
+        for (chain, square) in squares.iter_mut().enumerate() {
+            let x = simd.load(&group[chain * S::LANES..]);
+            *square = simd.fma(x, x, *square);
         }
-        let mut sum = squares[0].add(squares[1]).add(squares[2].add(squares[3]));
-        for i in vectors / CHAINS * CHAINS..width.div_ceil(V::LANES) {
-            let first = i * V::LANES;
-            let x = load::<V>(x.add(first), V::LANES.min(width - first));
-            sum = x.fma(x, sum);
-        }
-        sum.reduce_add()
     }
+    let [a, b, c, d] = squares;
+    let mut sum = simd.add(simd.add(a, b), simd.add(c, d));
+    for x in groups.remainder().chunks(S::LANES) {
+        let x = simd.load_partial(x);
+        sum = simd.fma(x, x, sum);
+    }
+    simd.reduce_add(sum)
 }
