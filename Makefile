@@ -13,7 +13,7 @@ VENV := .venv
 ROLLOUT_OUT ?= out/rollout
 ROLLOUT_ARGS ?= --episodes 3 --video
 
-SESSIONS := rollout test lint format bench setup core test-rust test-python test-compat test-clients test-ray test-aarch64 \
+SESSIONS := rollout test lint format bench package setup core test-rust test-python test-compat test-clients test-ray test-aarch64 \
 	bench-peers sanitize fuzz wheel test-wheel demo-policy pictures lock
 
 .DEFAULT_GOAL := help

@@ -211,14 +211,17 @@ def core(session: nox.Session) -> None:
 
 @nox.session
 def lint(session: nox.Session) -> None:
-    """Run the other checks of .ci/run: formatting, clippy, rustdoc, ruff, mypy, stubs."""
+    """Run the other checks of .ci/run: formatting, clippy, rustdoc, features, ruff, mypy, stubs, licences."""
     environment = working(session)
     cargo(session, "fmt", "--all", "--check")
-    cargo(
-        session, "clippy", "--workspace", "--all-targets", "--locked", "--quiet", "--", "--deny", "warnings"
-    )
-    cargo(session, "doc", "--workspace", "--no-deps", "--locked", "--quiet", RUSTDOCFLAGS="--deny warnings")
-    for command in ("ruff check .", "ruff format --check .", "mypy", "stubtest saccade._saccade"):
+    quiet = ("--workspace", "--locked", "--quiet")
+    cargo(session, "clippy", *quiet, "--all-targets", "--", "--deny", "warnings")
+    cargo(session, "doc", *quiet, "--no-deps", RUSTDOCFLAGS="--deny warnings")
+    for feature in ("", "processor", "rewrite"):  # each alone; the workspace above has all of them
+        options = ("--package", "saccade-vla", "--no-default-features", "--features", feature)
+        cargo(session, "clippy", "--locked", "--quiet", *options, "--", "--deny", "warnings")
+    deny = "cargo-deny --offline check licenses bans sources"
+    for command in ("ruff check .", "ruff format --check .", "mypy", "stubtest saccade._saccade", deny):
         program, *options = command.split()
         session.run(environment.program(program), *options, external=True)
 
@@ -230,6 +233,13 @@ def format(session: nox.Session) -> None:
     cargo(session, "fmt", "--all")
     session.run(environment.program("ruff"), "check", "--fix", ".", external=True)
     session.run(environment.program("ruff"), "format", ".", external=True)
+
+
+@nox.session
+def package(session: nox.Session) -> None:
+    """Pack the library crates as for publication, and build what they pack."""
+    needs(session, "rust")
+    cargo(session, "package", "--workspace", "--locked", *session.posargs)
 
 
 @nox.session
@@ -345,17 +355,8 @@ def sanitize(session: nox.Session) -> None:
     kernels = ("test", "--locked", "--quiet", "--package", "saccade-vla-kernels")
     skipped = [word for name in ASAN_SKIPPED.split() for word in ("--skip", name)]
     target = ("--target", "x86_64-unknown-linux-gnu", "--target-dir", "target/sanitize")
-    cargo(
-        session,
-        "+nightly",
-        *kernels,
-        "--lib",
-        "--tests",
-        *target,
-        "--",
-        *skipped,
-        RUSTFLAGS="-Zsanitizer=address",
-    )
+    options = ("--lib", "--tests", *target, "--", *skipped)
+    cargo(session, "+nightly", *kernels, *options, RUSTFLAGS="-Zsanitizer=address")
     tests = [word for name in VALGRIND_TESTS.split() for word in ("--test", name)]
     runner = {"CARGO_TARGET_X86_64_UNKNOWN_LINUX_GNU_RUNNER": "valgrind --quiet --error-exitcode=1"}
     cargo(session, *kernels, *tests, "--", "--test-threads", "1", "--skip", "float64", **runner)
@@ -406,9 +407,8 @@ def demo_policy(session: nox.Session) -> None:
     def saccade(*command: str) -> None:
         session.run(environment.program("saccade"), *command, external=True)
 
-    finished = (
-        out / "first.done"
-    )  # the demonstrations that follow would make the finished training look like another one
+    # The demonstrations that follow would make the finished training look like another one.
+    finished = out / "first.done"
     if not finished.exists():
         saccade("demos", "--out", demos)
         saccade("train", "--demos", demos, "--out", first)

@@ -41,7 +41,8 @@ const MAX_FILES: usize = 1000;
 /// No published checkpoint has folders in folders in folders.
 const MAX_DEPTH: usize = 4;
 
-/// The files next to a checkpoint's weights.
+/// The files next to a checkpoint's weights; by default none.
+#[derive(Default)]
 pub struct Companions {
     root: PathBuf,
     /// What is copied, by the path in the copy: where it is.
@@ -64,8 +65,7 @@ impl Companions {
         };
         let mut companions = Self {
             root: root.to_owned(),
-            carried: BTreeMap::new(),
-            left: Vec::new(),
+            ..Self::default()
         };
         if is_directory {
             let weights: BTreeSet<&Path> = weights.collect();

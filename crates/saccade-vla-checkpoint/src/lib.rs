@@ -1,10 +1,11 @@
-//! Checkpoint files: reading safetensors strictly, writing them all or nothing, and the files next to them.
+#![doc = include_str!("../README.md")]
 //!
-//! [`Checkpoint`] is one `.safetensors` file or a directory of shards. Headers are read and checked when it is opened; tensors are read when
-//! asked for, by position, so that any number of threads can read from one [`Checkpoint`]. [`CheckpointWriter`] writes a directory that
-//! appears whole or not at all. [`spec`] compares the tensors that are there with those that a model needs.
+//! # Where things are
 //!
-//! Nothing here knows a model or computes anything.
+//! [`Checkpoint`] is one `.safetensors` file or a directory of shards, [`Elements`] a tensor in memory, [`ReadAhead`] reads the next
+//! tensors meanwhile. [`CheckpointWriter`] writes a directory that appears whole or not at all, and [`Companions`] are the files next to
+//! weights that a copy takes along. [`spec`] compares the tensors that are there with those that a model needs. [`Error`] says which
+//! argument is to blame, what was expected and what was given.
 
 #![forbid(unsafe_code)]
 

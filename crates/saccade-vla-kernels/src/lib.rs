@@ -1,11 +1,14 @@
-//! The numerics of saccade: packed linear layers, fused attention, norms, rotary embedding and a private thread pool. It knows no model.
+#![doc = include_str!("../README.md")]
 //!
-//! Every kernel is written once over a small vector type and compiled for each instruction set ([`Isa`]). This is the only crate of saccade
-//! with `unsafe` code. All kernels promise that the bits of a row's result depend neither on the number of rows, nor on its place among
-//! them, nor on the number of threads.
+//! # Where things are
 //!
-//! Memory whose size the caller decides is claimed with an error, [`AllocError`], where there is none. Long calls can be stopped with
-//! [`interruptible`].
+//! [`Isa`] names an instruction set and finds the best one; every kernel takes one, or packs weights for one. Matrices are [`Rows`] and
+//! [`RowsMut`], views with a row stride. [`PackedLinear`] is the linear layer, [`PackedKeyValues`] the KV cache of [`attention`], and
+//! [`quantize_rows`] the rule of int8 weights. [`layer_norm`], [`rms_norm`], [`rotary_embedding`] and the activations work on rows;
+//! [`resize_area`] and its neighbours on images, bit for bit as OpenCV, Pillow and torch do.
+//!
+//! Memory whose size the caller decides is claimed with an error, [`AllocError`], where there is none. [`parallel_for`] runs on the pool,
+//! [`interruptible`] stops long calls, [`default_num_threads`] counts the cores that this process may use.
 
 mod activation;
 mod aligned;

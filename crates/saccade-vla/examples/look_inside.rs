@@ -1,6 +1,6 @@
 //! Records what the future tokens attend to, then removes what they attend to most and shows how the actions change.
 //!
-//! `cargo run --release -p saccade-vla --example look_inside [CHECKPOINT]`; without an argument, the policy that comes with saccade.
+//! `cargo run --release -p saccade-vla --example look_inside [CHECKPOINT]`; without an argument, a tiny one of random weights.
 
 use std::path::PathBuf;
 
@@ -48,13 +48,9 @@ fn attention_on_vl(trace: &Trace, num_layers: usize, is_cross: impl Fn(usize) ->
 }
 
 fn main() -> Result<()> {
-    let demo = concat!(
-        env!("CARGO_MANIFEST_DIR"),
-        "/../../python/saccade/checkpoints/demo"
-    );
-    let checkpoint = std::env::args_os()
-        .nth(1)
-        .map_or_else(|| demo.into(), PathBuf::from);
+    let tiny = concat!(env!("CARGO_MANIFEST_DIR"), "/examples/tiny");
+    let checkpoint = std::env::args_os().nth(1);
+    let checkpoint = checkpoint.map_or_else(|| tiny.into(), PathBuf::from);
     let head = ActionHead::load(&checkpoint, &LoadOptions::default())?;
     let config = head.config();
 

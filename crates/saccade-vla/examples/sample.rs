@@ -1,6 +1,6 @@
 //! Loads a checkpoint, encodes an observation and samples a chunk of actions.
 //!
-//! `cargo run --release -p saccade-vla --example sample [CHECKPOINT]`; without an argument, the policy that comes with saccade.
+//! `cargo run --release -p saccade-vla --example sample [CHECKPOINT]`; without an argument, a tiny one of random weights.
 
 use std::path::PathBuf;
 
@@ -20,13 +20,9 @@ fn numbers(len: usize, seed: u32) -> Vec<f32> {
 }
 
 fn main() -> Result<()> {
-    let demo = concat!(
-        env!("CARGO_MANIFEST_DIR"),
-        "/../../python/saccade/checkpoints/demo"
-    );
-    let checkpoint = std::env::args_os()
-        .nth(1)
-        .map_or_else(|| demo.into(), PathBuf::from);
+    let tiny = concat!(env!("CARGO_MANIFEST_DIR"), "/examples/tiny");
+    let checkpoint = std::env::args_os().nth(1);
+    let checkpoint = checkpoint.map_or_else(|| tiny.into(), PathBuf::from);
     let head = ActionHead::load(&checkpoint, &LoadOptions::default())?;
     let config = head.config();
     println!(

@@ -1,10 +1,19 @@
-//! The action head of GR00T-style robot policies on CPUs, exact and fast.
+#![doc = include_str!("../README.md")]
 //!
-//! An observation is encoded once ([`ActionHead::encode`]): the vision-language tokens pass their norm and self-attention, and every
-//! cross-attention block's keys and values are held in a [`Context`]. Chunks of actions are then sampled from it
-//! ([`ActionHead::sample`]), any number of times. What happens inside can be changed ([`Intervention`]) and kept ([`ActionHead::trace`]).
+//! # Where things are
 //!
-//! Where an equation comes from is said by its number in the GR00T action head's specification, as in "spec 1.6".
+//! - Head: [`ActionHead::encode`] turns an observation's [`Features`] into a [`Context`], which holds the KV cache of every cross-attention
+//!   block. [`ActionHead::sample`] integrates the flow from noise to actions. [`Chunking`] joins a chunk to the one before (real-time
+//!   chunking), [`CrossAttention`] is one such layer alone.
+//! - Backbone: [`Backbone::encode`] turns pixels and token ids into features, and reuses what an earlier call computed of the same views.
+//! - Processor (feature `processor`): [`Processor::process`] turns frames and an instruction into those pixels and ids.
+//! - Inspection: an [`Intervention`] cuts attention, adds biases to keys, or replaces rows; [`ActionHead::trace`] records what goes on
+//!   inside.
+//! - Checkpoints: [`HeadCheckpoint`] and [`BackboneCheckpoint`] are open and not loaded; [`convert`], [`quantize`] and [`resize`] (feature
+//!   `rewrite`) write changed copies. Files are read by [`files`].
+//!
+//! Everything that is loaded is immutable and serves any number of threads at once. An [`Error`] names the argument, what was expected and
+//! what was given. [`Precision`] says what each kind of layer computes in.
 
 #![forbid(unsafe_code)]
 
@@ -19,9 +28,11 @@ mod inspect;
 mod nn;
 mod ops;
 mod precision;
+#[cfg(feature = "processor")]
 mod processor;
 mod profile;
 mod recognise;
+#[cfg(feature = "rewrite")]
 mod rewrite;
 mod sampling;
 mod standalone_cross_attention;
@@ -47,20 +58,18 @@ pub use inspect::trace::{Keep, Recorded, StepBlock, Trace, TraceOptions};
 pub use nn::source::memory::{ElementsRef, TensorView, TensorViews};
 pub use ops::interruptible;
 pub use precision::Precision;
+#[cfg(feature = "processor")]
 pub use processor::{
     Frame, Observation, Prepared, Preprocessing, Processor, ProcessorOptions, ProcessorSource, Tokenizer,
     TokenizerFiles, View,
 };
 pub use profile::{Counter, Part, Profile, Profiling};
 pub use recognise::{HeadCheckpoint, TensorFacts};
-pub use rewrite::adapter::open_base;
-pub use rewrite::convert::{ConvertOptions, ConvertReport, convert};
-pub use rewrite::float::Float;
-pub use rewrite::quantize::{QuantizeReport, quantize};
-pub use rewrite::resize::{
-    MergedTokens, ResizeOptions, ResizeReport, merge_future_tokens, resize, resized_config,
+#[cfg(feature = "rewrite")]
+pub use rewrite::{
+    ConvertOptions, ConvertReport, Float, MergedTokens, QuantizeReport, ResizeOptions, ResizeReport,
+    RewriteOptions, Written, convert, merge_future_tokens, open_base, quantize, resize, resized_config,
 };
-pub use rewrite::{RewriteOptions, Written};
 pub use saccade_vla_checkpoint::{self as files, Checkpoint, Elements};
 pub use saccade_vla_kernels::{
     Arithmetic, CpuReport, Isa, StayOnThisThread, default_num_threads, peak, stay_on_this_thread,

@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use saccade_vla_checkpoint::{Checkpoint, TensorSpec, read_text};
+use saccade_vla_checkpoint::{Checkpoint, read_text};
 
 use super::config::BackboneConfig;
 use super::json::GivenConfig;
@@ -74,7 +74,8 @@ impl BackboneCheckpoint {
     }
 
     /// The tensors that are read, by their names without the prefix.
-    pub(crate) fn specs(&self) -> &[TensorSpec] {
+    #[cfg(feature = "rewrite")]
+    pub(crate) fn specs(&self) -> &[saccade_vla_checkpoint::TensorSpec] {
         &self.plan.specs
     }
 }

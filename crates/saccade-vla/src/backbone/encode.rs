@@ -82,6 +82,25 @@ impl Backbone {
     /// From `previous`, features that this backbone made, views with the same pixels are taken, and the rows, keys and values of tokens at the
     /// beginning of a prompt that are the same. The result has the same bits without. Where something is recorded, all of it is computed.
     ///
+    /// ```
+    /// # use saccade_vla::{Array, Backbone, BackboneInputs, BackboneKeep, BackboneLoadOptions};
+    /// # let backbone = Backbone::load("examples/tiny".as_ref(), &BackboneLoadOptions::default())?;
+    /// let pixels = vec![0.0; 3 * 56 * 56];
+    /// let pixels = Array::new(&pixels, &[1, 3, 56, 56])?;
+    /// // Two words and the 16 tokens of the image. A later prompt begins in the same way.
+    /// let image = [backbone.config().image_token_id as i64; 16];
+    /// let ids: Vec<i64> = [5, 6].into_iter().chain(image).collect();
+    /// let inputs = BackboneInputs::new(vec![pixels], Array::new(&ids, &[1, 18])?);
+    /// let first = backbone.encode(&[inputs], &[], BackboneKeep::default())?;
+    /// assert_eq!((first[0].num_tokens(), first[0].feature_dim()), (18, 32));
+    ///
+    /// let longer: Vec<i64> = ids.iter().copied().chain([7]).collect();
+    /// let inputs = BackboneInputs::new(vec![pixels], Array::new(&longer, &[1, 19])?);
+    /// let second = backbone.encode(&[inputs], &[&first[0]], BackboneKeep::default())?;
+    /// assert_eq!(first[0].features(0), &second[0].features(0)[..18 * 32]);
+    /// # Ok::<(), saccade_vla::Error>(())
+    /// ```
+    ///
     /// # Errors
     /// [`Error::Shape`] and [`Error::Input`] for inputs that do not fit, features of another backbone, and a result that is not finite;
     /// [`Error::Memory`].

@@ -67,6 +67,13 @@ impl Backbone {
     ///
     /// The version is that of the tensors. Sizes that the config does not hold are those of the published model.
     ///
+    /// ```
+    /// use saccade_vla::{Backbone, BackboneLoadOptions};
+    /// let backbone = Backbone::load("examples/tiny".as_ref(), &BackboneLoadOptions::default())?;
+    /// assert_eq!(backbone.config().version, "n1.5");
+    /// # Ok::<(), saccade_vla::Error>(())
+    /// ```
+    ///
     /// # Errors
     /// [`Error::File`] for a path that is not there; [`Error::Checkpoint`] for a config or weights that are broken, not finite or do not
     /// fit each other (all that does not fit is listed); [`Error::Input`] for options out of range; [`Error::Memory`].

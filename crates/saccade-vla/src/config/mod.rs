@@ -6,7 +6,9 @@ mod head_config;
 mod json;
 mod versions;
 
-pub(crate) use checkpoint_config::{CheckpointConfig, HEAD_KEY, OWN_KEY, Object};
+#[cfg(feature = "rewrite")]
+pub(crate) use checkpoint_config::HEAD_KEY;
+pub(crate) use checkpoint_config::{CheckpointConfig, OWN_KEY, Object};
 pub use head_config::HeadConfig;
 pub(crate) use head_config::Reads;
 pub(crate) use versions::{Feature, Version};

@@ -86,6 +86,19 @@ impl<'a> Features<'a> {
 impl ActionHead {
     /// Encodes observations: `vlln`, the VL self-attention, and the keys and values of every cross-attention block.
     ///
+    /// ```
+    /// # use saccade_vla::{ActionHead, Array, Features, LoadOptions};
+    /// # let head = ActionHead::load("examples/tiny".as_ref(), &LoadOptions::default())?;
+    /// let shape = [2, 20, head.config().context_dim]; // two observations of 20 tokens
+    /// let tokens = vec![0.1; shape.iter().product()];
+    /// let padding: Vec<bool> = (0..40).map(|token| token < 5).collect();
+    /// let features = Features::new(Array::new(&tokens, &shape)?)
+    ///     .with_drop_vl(Array::new(&padding, &shape[..2])?);
+    /// let context = head.encode(&features)?;
+    /// assert_eq!((context.batch(), context.num_vl_tokens()), (2, 20));
+    /// # Ok::<(), saccade_vla::Error>(())
+    /// ```
+    ///
     /// # Errors
     /// [`Error::Shape`] and [`Error::Input`] for features or masks that do not fit, [`Error::Input`] also for a result that is not finite;
     /// [`Error::Memory`].

@@ -110,6 +110,14 @@ impl LoadOptions {
 impl ActionHead {
     /// Loads a head from `source`: one `.safetensors` file, or a directory of one or more of them with a `config.json`.
     ///
+    /// ```
+    /// use saccade_vla::{ActionHead, LoadOptions, Precision};
+    /// let options = LoadOptions::default().with_precision(Precision::Bfloat16).with_num_threads(1);
+    /// let head = ActionHead::load("examples/tiny".as_ref(), &options)?;
+    /// assert_eq!((head.config().num_layers, head.num_threads()), (2, 1));
+    /// # Ok::<(), saccade_vla::Error>(())
+    /// ```
+    ///
     /// # Errors
     /// [`Error::File`] for a path that is not there; [`Error::Checkpoint`] for a config or weights that are broken, not finite or do not
     /// fit each other (all that does not fit is listed); [`Error::Input`] for options out of range; [`Error::Memory`].

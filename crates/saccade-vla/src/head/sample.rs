@@ -110,6 +110,25 @@ impl ActionHead {
     /// `noise` `(batch, action_horizon, encoder_action_dim)`, or `(batch, num_samples, action_horizon, encoder_action_dim)` with
     /// `num_samples`. `out` has the shape of the noise, with `action_dim` for its last axis.
     ///
+    /// ```
+    /// # use saccade_vla::{ActionHead, Array, ArrayMut, Features, LoadOptions, Sampling};
+    /// # let head = ActionHead::load("examples/tiny".as_ref(), &LoadOptions::default())?;
+    /// # let context = head.encode(&Features::new(Array::new(&[0.1; 640], &[1, 20, 32])?))?;
+    /// let config = head.config();
+    /// let state = Array::new(&[0.0; 8], &[1, 8])?;
+    /// let noise_shape = [1, 3, config.action_horizon, config.encoder_action_dim];
+    /// let noise = vec![0.5; noise_shape.iter().product()];
+    /// let noise = Array::new(&noise, &noise_shape)?;
+    /// // Three chunks in two steps each.
+    /// let sampling = Sampling::default().with_num_samples(3).with_num_steps(2);
+    /// let mut actions = vec![0.0; 3 * config.action_horizon * config.action_dim];
+    /// let shape = [1, 3, config.action_horizon, config.action_dim];
+    /// let out = ArrayMut::new(&mut actions, &shape)?;
+    /// head.sample(&context, state, Array::new(&[0], &[])?, noise, &sampling, out)?;
+    /// assert!(actions.iter().all(|action| action.is_finite()));
+    /// # Ok::<(), saccade_vla::Error>(())
+    /// ```
+    ///
     /// # Errors
     /// [`Error::Shape`] and [`Error::Input`] for arguments that do not fit, [`Error::Input`] also for actions that are not finite;
     /// [`Error::Memory`]. `out` is then untouched.

@@ -18,6 +18,19 @@ impl ActionHead {
     /// There is one chunk for each observation, and all rows run at every step: `sampling.num_samples` and `sampling.future_refresh` must
     /// be none, and `sampling.integrator` Euler's.
     ///
+    /// ```
+    /// # use saccade_vla::{ActionHead, Array, Features, Keep, LoadOptions, Sampling, TraceOptions};
+    /// # let head = ActionHead::load("examples/tiny".as_ref(), &LoadOptions::default())?;
+    /// # let context = head.encode(&Features::new(Array::new(&[0.1; 640], &[1, 20, 32])?))?;
+    /// # let (state, noise) = (Array::new(&[0.0; 8], &[1, 8])?, Array::new(&[0.5; 128], &[1, 16, 8])?);
+    /// let options = TraceOptions::new(Keep::default().with_attention(true));
+    /// let trace = head.trace(&context, state, Array::new(&[0], &[])?, noise, &Sampling::default(), &options)?;
+    /// let attention = &trace.recorded.attention[&(0, 0)]; // of the first step and block
+    /// assert_eq!(attention.shape()[0], 1); // (batch, heads, queries, keys)
+    /// assert_eq!(attention.shape()[3], 20);
+    /// # Ok::<(), saccade_vla::Error>(())
+    /// ```
+    ///
     /// # Errors
     /// [`Error::Shape`] and [`Error::Input`] for arguments that do not fit, for a trace of more than `options.max_bytes`, and for actions that
     /// are not finite; [`Error::Memory`].

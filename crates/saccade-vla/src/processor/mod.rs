@@ -162,6 +162,22 @@ impl Processor {
 
     /// The inputs of a batch of observations.
     ///
+    /// ```
+    /// use saccade_vla::{Array, Frame, Observation, ProcessorSource};
+    /// let processor = ProcessorSource::open("examples/tiny".as_ref())?.processor(None, None, None)?;
+    /// let pixels = vec![128; 48 * 64 * 3];
+    /// let frame = Frame::U8(Array::new(&pixels, &[48, 64, 3])?);
+    /// let observation = Observation {
+    ///     views: vec![(Some("front"), frame)],
+    ///     instruction: Some("open the drawer"),
+    ///     ..Observation::default()
+    /// };
+    /// let prepared = processor.process(&[observation])?;
+    /// assert_eq!(prepared.pixel_values[0].shape(), [1, 3, 56, 56]);
+    /// assert_eq!(prepared.input_ids.len(), prepared.length);
+    /// # Ok::<(), saccade_vla::Error>(())
+    /// ```
+    ///
     /// # Errors
     /// [`Error::Shape`] and [`Error::Input`] for frames that are none, for observations with different views, and for an instruction that is too
     /// long or that changes the number of image tokens; [`Error::Memory`].

@@ -79,6 +79,17 @@ pub struct ConvertReport {
 /// NaN and infinity are copied too; [`ActionHead::load`](crate::ActionHead::load) refuses them in the copy as in the source. One piece of a
 /// tensor is in memory at a time. `progress(done, total)`, in bytes read, is called after each tensor; if it returns false, nothing is written.
 ///
+/// ```
+/// # let out = std::env::temp_dir().join(format!("saccade-convert-{}", std::process::id()));
+/// use saccade_vla::{ConvertOptions, Float, RewriteOptions, convert};
+/// let mut options = ConvertOptions::new(RewriteOptions::default());
+/// options.dtype = Some(Float::F32);
+/// let report = convert("examples/tiny".as_ref(), &out, &options, |_, _| true)?;
+/// assert!(report.bytes_after > report.bytes_before);
+/// # std::fs::remove_dir_all(&out).ok();
+/// # Ok::<(), saccade_vla::Error>(())
+/// ```
+///
 /// # Errors
 /// Of kind [`Checkpoint`](crate::ErrorKind::Checkpoint) for a source that is broken or does not fit its config, for an adapter that is not plain
 /// LoRA or does not fit the source, and for a finite number that the type cannot hold; [`Input`](crate::ErrorKind::Input) for ids out of range, and if `out` exists and `force` is not set, holds anything but

@@ -1,11 +1,11 @@
 //! Writing a checkpoint from another: opening the source, choosing what is kept, writing the copy.
 
-pub(crate) mod adapter;
-pub(crate) mod convert;
-pub(crate) mod float;
+mod adapter;
+mod convert;
+mod float;
 mod json_edit;
-pub(crate) mod quantize;
-pub(crate) mod resize;
+mod quantize;
+mod resize;
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -15,7 +15,13 @@ use saccade_vla_checkpoint::{Checkpoint, CheckpointWriter, Companions, PlannedTe
 use crate::config::HeadConfig;
 use crate::error::{Error, Problem, Result, problem};
 use crate::ops::check_interrupted;
-use adapter::{is_beside, open_base};
+use adapter::is_beside;
+
+pub use adapter::open_base;
+pub use convert::{ConvertOptions, ConvertReport, convert};
+pub use float::Float;
+pub use quantize::{QuantizeReport, quantize};
+pub use resize::{MergedTokens, ResizeOptions, ResizeReport, merge_future_tokens, resize, resized_config};
 
 /// Published checkpoints are cut into files of this size.
 const MAX_SHARD_BYTES: u64 = 5_000_000_000;

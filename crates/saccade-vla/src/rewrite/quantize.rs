@@ -47,6 +47,15 @@ pub struct QuantizeReport {
 /// One tensor is in memory at a time. `progress(done, total)`, in bytes read, is called after each tensor; if it returns false, nothing is
 /// written.
 ///
+/// ```
+/// # let out = std::env::temp_dir().join(format!("saccade-quantize-{}", std::process::id()));
+/// use saccade_vla::{ActionHead, LoadOptions, RewriteOptions, quantize};
+/// let report = quantize("examples/tiny".as_ref(), &out, &RewriteOptions::default(), |_, _| true)?;
+/// ActionHead::load(&out, &LoadOptions::default())?;
+/// # std::fs::remove_dir_all(&out).ok();
+/// # Ok::<(), saccade_vla::Error>(())
+/// ```
+///
 /// # Errors
 /// Of kind [`Checkpoint`](crate::ErrorKind::Checkpoint) for a source that is broken, does not fit its config or is quantised already, and for
 /// weights of the head that are not finite; [`Input`](crate::ErrorKind::Input) if `out` exists and `force` is not set, holds anything but a

@@ -76,6 +76,16 @@ pub struct ResizeReport {
 ///
 /// `progress(done, total)`, in bytes read, is called after each tensor; if it returns false, nothing is written.
 ///
+/// ```
+/// # let out = std::env::temp_dir().join(format!("saccade-resize-{}", std::process::id()));
+/// use saccade_vla::{ResizeOptions, RewriteOptions, resize};
+/// let options = ResizeOptions::new(RewriteOptions::default(), 4);
+/// let report = resize("examples/tiny".as_ref(), &out, &options, |_, _| true)?;
+/// assert_eq!((report.num_before, report.num_after), (8, 4));
+/// # std::fs::remove_dir_all(&out).ok();
+/// # Ok::<(), saccade_vla::Error>(())
+/// ```
+///
 /// # Errors
 /// Of kind [`Checkpoint`](crate::ErrorKind::Checkpoint) for a source that is broken or does not fit its config, a version without future
 /// tokens, a source that has none, a config with different numbers of them, and tokens that are not finite; [`Input`](crate::ErrorKind::Input)
