@@ -65,7 +65,8 @@ pub fn gelu_erf(isa: Isa, x: &mut [f32]) {
 
 /// `x / (1 + exp(-x))`, in place.
 ///
-/// Within 4 ULP down to `x = -87`; below, where `exp(-x)` overflows, within `1e-35`. NaN stays, `-inf` gives `-0`.
+/// Within 4 ULP down to `x = -87`; below, where `exp(-x)` overflows, within `1e-35`. NaN stays, `-inf` gives
+/// `-0`.
 ///
 /// ```
 /// let mut x = [0.0, 1.0];
@@ -95,7 +96,8 @@ pub fn relu(isa: Isa, x: &mut [f32]) {
 
 /// `exp(x)`, in place, as the activations compute it.
 ///
-/// Within 2 ULP where the exact value is a normal number, within `3e-45` below. 0 at `-inf`, infinity above 88.73, NaN at NaN.
+/// Within 2 ULP where the exact value is a normal number, within `3e-45` below. 0 at `-inf`, infinity above
+/// 88.73, NaN at NaN.
 ///
 /// ```
 /// let mut x = [0.0, f32::NEG_INFINITY];
@@ -123,7 +125,8 @@ mod tests {
         coarse.chain(fine).collect()
     }
 
-    /// How near a function is to the exact one: in units of the last place from `from` to `to`, in absolute terms below `from`.
+    /// How near a function is to the exact one: in units of the last place from `from` to `to`, in absolute
+    /// terms below `from`.
     struct Bounds {
         from: f32,
         to: f32,
@@ -177,7 +180,8 @@ mod tests {
         x / (1.0 + (-2.0 * u).exp())
     }
 
-    /// By `erfc(z) = (2 / sqrt(pi)) exp(-z^2) (z + z^3 2/3 + ...)` from 1 for small `z`, and its continued fraction for large ones.
+    /// By `erfc(z) = (2 / sqrt(pi)) exp(-z^2) (z + z^3 2/3 + ...)` from 1 for small `z`, and its continued
+    /// fraction for large ones.
     fn exact_gelu_erf(x: f64) -> f64 {
         let z = x.abs() / std::f64::consts::SQRT_2;
         let erfc = if z < 2.0 {

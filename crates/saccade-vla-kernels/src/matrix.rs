@@ -4,7 +4,8 @@ use std::ops::Range;
 
 use crate::rows::Rows;
 
-/// A matrix `(num_rows, num_columns)` as weights may be stored: row-major with any row stride, or the transpose of that.
+/// A matrix `(num_rows, num_columns)` as weights may be stored: row-major with any row stride, or the
+/// transpose of that.
 ///
 /// ```
 /// use saccade_vla_kernels::{Matrix, Rows};

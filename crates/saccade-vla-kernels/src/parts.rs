@@ -5,13 +5,16 @@ use std::ops::Range;
 use crate::pool::parallel_for;
 use crate::rows::{RowsMut, SharedRows};
 
-/// Elements from which a second thread pays: below, one core is done in less time than it takes to wake another.
+/// Elements from which a second thread pays: below, one core is done in less time than it takes to wake
+/// another.
 const ELEMENTS_FOR_THREADS: usize = 1 << 16;
 
-/// Elements of one task: long enough that dealing it costs nothing, short enough that threads finish together.
+/// Elements of one task: long enough that dealing it costs nothing, short enough that threads finish
+/// together.
 const ELEMENTS_PER_TASK: usize = 1 << 13;
 
-/// Runs `work` on parts of the rows of `out`, on as many threads as pay; with each part, the numbers of its rows.
+/// Runs `work` on parts of the rows of `out`, on as many threads as pay; with each part, the numbers of its
+/// rows.
 pub(crate) fn parallel_rows<T: Send>(
     threads: usize,
     out: RowsMut<'_, T>,
@@ -28,7 +31,8 @@ pub(crate) fn parallel_rows<T: Send>(
     });
 }
 
-/// The number of threads, at most `threads`, and of tasks, at most `most_tasks`, for `rows` rows of `width` elements.
+/// The number of threads, at most `threads`, and of tasks, at most `most_tasks`, for `rows` rows of `width`
+/// elements.
 pub(crate) fn threads_and_tasks(
     threads: usize,
     rows: usize,
@@ -45,8 +49,8 @@ pub(crate) fn threads_and_tasks(
     (threads, elements.div_ceil(ELEMENTS_PER_TASK).min(most_tasks))
 }
 
-/// The part of `count` that task number `index` of `parts` has. The parts differ by one at most, and none overlaps
-/// another: tasks that write them rely on it, so no product here may wrap.
+/// The part of `count` that task number `index` of `parts` has. The parts differ by one at most, and none
+/// overlaps another: tasks that write them rely on it, so no product here may wrap.
 #[inline(always)]
 pub(crate) fn part(count: usize, index: usize, parts: usize) -> Range<usize> {
     part_start(count, index, parts)..part_start(count, index + 1, parts)

@@ -1,16 +1,18 @@
-//! Rotary position embedding, with the two halves of a head as the parts of the complex numbers that are rotated.
+//! Rotary position embedding, with the two halves of a head as the parts of the complex numbers that are
+//! rotated.
 
 use crate::isa::Isa;
 use crate::parts::parallel_rows;
 use crate::rows::{Rows, RowsMut};
 use crate::simd::{Kernel, Simd};
 
-/// Rotates each head of each row in place, as Llama and Qwen do: `(a, b)` becomes `(a cos - b sin, b cos + a sin)`.
+/// Rotates each head of each row in place, as Llama and Qwen do: `(a, b)` becomes
+/// `(a cos - b sin, b cos + a sin)`.
 ///
-/// `x` is `(rows, num_heads * head_dim)`. `cos` and `sin` are `(rows, pairs)`, the angles of each row's position, for all
-/// of its heads. With `pairs = head_dim / 2`, element `i` of a head is `a` and element `pairs + i` is `b` of pair `i`;
-/// with fewer, only the first `2 * pairs` elements of a head are rotated. An element's bits depend on its pair and its
-/// angle alone.
+/// `x` is `(rows, num_heads * head_dim)`. `cos` and `sin` are `(rows, pairs)`, the angles of each row's
+/// position, for all of its heads. With `pairs = head_dim / 2`, element `i` of a head is `a` and element
+/// `pairs + i` is `b` of pair `i`; with fewer, only the first `2 * pairs` elements of a head are rotated. An
+/// element's bits depend on its pair and its angle alone.
 ///
 /// # Panics
 /// If a shape does not fit, or this CPU lacks `isa`.

@@ -3,7 +3,8 @@
 use std::marker::PhantomData;
 use std::ops::Range;
 
-/// A matrix `(num_rows, num_columns)` whose rows are contiguous, with any number of elements from one row to the next.
+/// A matrix `(num_rows, num_columns)` whose rows are contiguous, with any number of elements from one row to
+/// the next.
 ///
 /// ```
 /// use saccade_vla_kernels::Rows;
@@ -31,8 +32,8 @@ pub struct Rows<'a, T = f32> {
 /// ```
 #[derive(Debug)]
 pub struct RowsMut<'a, T = f32> {
-    /// Row 0; for as long as `'a`, nothing else reads or writes the elements of any row. What is between rows may be
-    /// another view's. Rows do not overlap.
+    /// Row 0; for as long as `'a`, nothing else reads or writes the elements of any row. What is between rows
+    /// may be another view's. Rows do not overlap.
     first: *mut T,
     shape: RowShape,
     borrowed: PhantomData<&'a mut [T]>,
@@ -96,7 +97,8 @@ impl RowShape {
         Self {
             num_rows,
             num_columns,
-            // Rows without elements are all at the beginning, wherever that is: no pointer to one is outside the data.
+            // Rows without elements are all at the beginning, wherever that is: no pointer to one is outside
+            // the data.
             row_stride: if num_columns == 0 { 0 } else { row_stride },
         }
     }
@@ -168,8 +170,8 @@ impl<'a, T> Rows<'a, T> {
         Self::of(data.as_ptr(), RowShape::contiguous(data.len(), num_columns))
     }
 
-    /// `num_rows` rows of `num_columns` elements, the first at the beginning of `data`, each `row_stride` elements after
-    /// the one before.
+    /// `num_rows` rows of `num_columns` elements, the first at the beginning of `data`, each `row_stride`
+    /// elements after the one before.
     ///
     /// # Panics
     /// If `data` is too short.
@@ -296,8 +298,8 @@ impl<'a, T> RowsMut<'a, T> {
         Self::of(data.as_mut_ptr(), shape)
     }
 
-    /// `num_rows` rows of `num_columns` elements, the first at the beginning of `data`, each `row_stride` elements after
-    /// the one before.
+    /// `num_rows` rows of `num_columns` elements, the first at the beginning of `data`, each `row_stride`
+    /// elements after the one before.
     ///
     /// # Panics
     /// If `data` is too short, or rows overlap.
@@ -310,6 +312,28 @@ impl<'a, T> RowsMut<'a, T> {
             "row_stride: expected at least the {num_columns} elements of a row, got {row_stride}"
         );
         Self::of(data.as_mut_ptr(), shape)
+    }
+
+    /// Rows of memory that is not a slice, because what is between them may be in use elsewhere, or not
+    /// initialised.
+    ///
+    /// # Safety
+    /// From `first` on there are `num_rows` rows of `num_columns` elements, `row_stride` apart and not
+    /// overlapping. They are initialised, and nothing else reads or writes them for as long as `'a`.
+    pub(crate) unsafe fn from_raw(
+        first: *mut T,
+        num_rows: usize,
+        num_columns: usize,
+        row_stride: usize,
+    ) -> Self {
+        Self::of(
+            first,
+            RowShape {
+                num_rows,
+                num_columns,
+                row_stride,
+            },
+        )
     }
 
     fn of(first: *mut T, shape: RowShape) -> Self {
@@ -357,8 +381,8 @@ impl<'a, T> RowsMut<'a, T> {
         let (first, shape) = (self.first, self.shape);
         (0..shape.num_rows).map(move |row| {
             let Range { start, end } = shape.row(row);
-            // SAFETY: the row exists and is visited once, rows do not overlap, and the view is borrowed for as long as
-            // their elements are.
+            // SAFETY: the row exists and is visited once, rows do not overlap, and the view is borrowed for
+            // as long as their elements are.
             unsafe { std::slice::from_raw_parts_mut(first.add(start), end - start) }
         })
     }

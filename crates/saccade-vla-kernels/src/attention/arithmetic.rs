@@ -1,235 +1,210 @@
-//! How a tile multiplies: float32, with keys and values held so or widened from bfloat16, or pairs of bfloat16 in one instruction.
+//! The arithmetic of a tile: float32, with keys and values stored so or widened from bfloat16, or pairs of
+//! bfloat16 in one instruction.
 
 use std::marker::PhantomData;
 
 use half::bf16;
 
-use crate::simd::old::math::{EXP2, EXP2_FOR_BF16, exp_below_zero};
-use crate::simd::{Dots, Simd, Vector};
+use crate::simd::Simd;
+use crate::simd::bits::Bits;
+use crate::simd::math::{EXP2, EXP2_FOR_BF16, exp_below_zero};
 
-/// How keys and values are held, and what multiplies them. A word of them is met by one or two broadcast factors, words too, that are made
-/// from queries and probabilities.
-///
-/// # Safety
-/// Every method is called within [`Simd::run`] of `S`, with pointers that are valid for all that it names.
+/// How keys and values are stored, and what multiplies them. A word of them is met by one or two broadcast
+/// factors, words too, that are made from queries and probabilities.
 pub(super) trait TileArithmetic<S: Simd> {
     /// Elements of the summed dimension in a word of keys or values.
     const STEP: usize;
     /// Factors that meet it, one after the other.
     const FACTORS: usize;
-    /// Keeps `2 * LANES` elements as factors.
-    unsafe fn store_factors(first: S::Vector, second: S::Vector, to: *mut f32);
-    /// Adds them to `sum`, as they are kept.
-    unsafe fn add_factors(sum: S::Vector, first: S::Vector, second: S::Vector, kept: *const f32)
-    -> S::Vector;
-    /// Element number `index` of what [`Self::store_factors`] kept.
-    unsafe fn element(factors: *const f32, index: usize) -> f32;
+    /// `2 * LANES` elements as factors: `2 * LANES * FACTORS / STEP` words.
+    type Factors: Bits;
     /// A vector of factors, or of what they multiply.
     type Operand: Copy;
-    /// Every lane the factor at `from`.
-    unsafe fn broadcast(from: *const f32) -> Self::Operand;
-    /// What factor number `part` of a word multiplies.
-    unsafe fn column(from: *const u32, part: usize) -> Self::Operand;
-    /// `sum` and the products of factor and column.
-    unsafe fn multiply_add(factor: Self::Operand, column: Self::Operand, sum: S::Vector) -> S::Vector;
-    /// Four factors, where there is [`Vector::BY_LANE`].
-    unsafe fn four(from: *const f32) -> Self::Operand;
-    /// `sum` and the products of the factor in lane `LANE` of four and column.
-    unsafe fn multiply_add_lane<const LANE: i32>(
+
+    /// Makes factors of `2 * LANES` elements.
+    fn factors(simd: S, first: S::F32, second: S::F32) -> Self::Factors;
+    /// Adds `2 * LANES` elements to `sum`, as they are in their factors.
+    fn add(simd: S, sum: S::F32, first: S::F32, second: S::F32, factors: Self::Factors) -> S::F32;
+    /// Element number `index` of the elements that `factors` were made of.
+    fn element(factors: &[f32], index: usize) -> f32;
+    /// Every lane the factor `word`.
+    fn broadcast(simd: S, word: u32) -> Self::Operand;
+    /// A vector of factors.
+    fn operand(simd: S, factors: S::I32) -> Self::Operand;
+    /// What factor number `part` multiplies of each word.
+    fn column(simd: S, words: S::I32, part: usize) -> Self::Operand;
+    /// `factor * column + sum`, or the sum of two products where a factor is a pair.
+    fn multiply_add(simd: S, factor: Self::Operand, column: Self::Operand, sum: S::F32) -> S::F32;
+    /// The same with the factor in lane `LANE`, where there is [`Simd::BY_LANE`].
+    fn multiply_add_lane<const LANE: i32>(
+        simd: S,
         factors: Self::Operand,
         column: Self::Operand,
-        sum: S::Vector,
-    ) -> S::Vector;
+        sum: S::F32,
+    ) -> S::F32;
     /// Element number `part` of each word of values.
-    unsafe fn widen(from: *const u32, part: usize) -> S::Vector;
+    fn widen(simd: S, words: S::I32, part: usize) -> S::F32;
     /// `exp(x)` for `x <= 0`, NaN where it is NaN.
-    unsafe fn exp(x: S::Vector) -> S::Vector;
+    fn exp(simd: S, x: S::F32) -> S::F32;
 }
 
-/// How keys and values are held where products are of float32.
+/// How keys and values are stored where products are of float32.
 pub(super) trait Stored {
     /// Elements of a word.
     const STEP: usize;
 
     /// Element number `part` of each word.
-    ///
-    /// # Safety
-    /// A whole vector of words is there; the CPU has the instruction set of `V`.
-    unsafe fn widen<V: Vector>(from: *const u32, part: usize) -> V;
+    fn widen<S: Simd>(simd: S, words: S::I32, part: usize) -> S::F32;
 }
 
 /// float32.
-pub(super) struct HeldF32;
+pub(super) struct StoredF32;
 
-impl Stored for HeldF32 {
+impl Stored for StoredF32 {
     const STEP: usize = 1;
 
     #[inline(always)]
-    unsafe fn widen<V: Vector>(from: *const u32, _: usize) -> V {
-        // SAFETY: the caller's promise.
-        unsafe { V::load(from.cast()) }
+    fn widen<S: Simd>(simd: S, words: S::I32, _: usize) -> S::F32 {
+        simd.bits_to_f32(words)
     }
 }
 
 /// Pairs of bfloat16, widened in registers: the bits of float32 with the same keys and values.
-pub(super) struct HeldBf16;
+pub(super) struct StoredBf16;
 
-impl Stored for HeldBf16 {
+impl Stored for StoredBf16 {
     const STEP: usize = 2;
 
     #[inline(always)]
-    unsafe fn widen<V: Vector>(from: *const u32, part: usize) -> V {
-        // SAFETY: the caller's promise.
-        unsafe {
-            let words = V::load_ints(from.cast());
-            if part == 0 {
-                V::low_halves(words)
-            } else {
-                V::high_halves(words)
-            }
+    fn widen<S: Simd>(simd: S, words: S::I32, part: usize) -> S::F32 {
+        if part == 0 {
+            simd.low_halves(words)
+        } else {
+            simd.high_halves(words)
         }
     }
 }
 
-/// Products of float32, of keys and values held as `H`.
-pub(super) struct Float32<H>(PhantomData<H>);
+/// Products of float32, of keys and values stored as `T`.
+pub(super) struct Float32Products<T>(PhantomData<T>);
 
-impl<S: Simd<Vector = V>, V: Vector, H: Stored> TileArithmetic<S> for Float32<H> {
-    const STEP: usize = H::STEP;
-    const FACTORS: usize = H::STEP;
-    type Operand = V;
+impl<S: Simd, T: Stored> TileArithmetic<S> for Float32Products<T> {
+    const STEP: usize = T::STEP;
+    const FACTORS: usize = T::STEP;
+    type Factors = [S::F32; 2];
+    type Operand = S::F32;
 
     #[inline(always)]
-    unsafe fn store_factors(first: V, second: V, to: *mut f32) {
-        // SAFETY: the trait's contract; so throughout.
-        unsafe {
-            first.store(to);
-            second.store(to.add(V::LANES));
-        }
+    fn factors(_: S, first: S::F32, second: S::F32) -> [S::F32; 2] {
+        [first, second]
     }
 
     #[inline(always)]
-    unsafe fn element(factors: *const f32, index: usize) -> f32 {
-        // SAFETY: as above.
-        unsafe { *factors.add(index) }
+    fn add(simd: S, sum: S::F32, first: S::F32, second: S::F32, _: [S::F32; 2]) -> S::F32 {
+        simd.add(simd.add(sum, first), second)
     }
 
     #[inline(always)]
-    unsafe fn add_factors(sum: V, first: V, second: V, _: *const f32) -> V {
-        // SAFETY: as above.
-        unsafe { sum.add(first).add(second) }
+    fn element(factors: &[f32], index: usize) -> f32 {
+        factors[index]
     }
 
     #[inline(always)]
-    unsafe fn broadcast(from: *const f32) -> V {
-        // SAFETY: as above.
-        unsafe { V::splat(*from) }
+    fn broadcast(simd: S, word: u32) -> S::F32 {
+        simd.splat(f32::from_bits(word))
     }
 
     #[inline(always)]
-    unsafe fn column(from: *const u32, part: usize) -> V {
-        // SAFETY: as above.
-        unsafe { H::widen(from, part) }
+    fn operand(simd: S, factors: S::I32) -> S::F32 {
+        simd.bits_to_f32(factors)
     }
 
     #[inline(always)]
-    unsafe fn multiply_add(factor: V, column: V, sum: V) -> V {
-        // SAFETY: as above.
-        unsafe { factor.fma(column, sum) }
+    fn column(simd: S, words: S::I32, part: usize) -> S::F32 {
+        T::widen(simd, words, part)
     }
 
     #[inline(always)]
-    unsafe fn four(from: *const f32) -> V {
-        // SAFETY: as above.
-        unsafe { V::load(from) }
+    fn multiply_add(simd: S, factor: S::F32, column: S::F32, sum: S::F32) -> S::F32 {
+        simd.fma(factor, column, sum)
     }
 
     #[inline(always)]
-    unsafe fn multiply_add_lane<const LANE: i32>(factors: V, column: V, sum: V) -> V {
-        // SAFETY: as above.
-        unsafe { column.fma_lane::<LANE>(factors, sum) }
+    fn multiply_add_lane<const LANE: i32>(simd: S, factors: S::F32, column: S::F32, sum: S::F32) -> S::F32 {
+        simd.fma_lane::<LANE>(column, factors, sum)
     }
 
     #[inline(always)]
-    unsafe fn widen(from: *const u32, part: usize) -> V {
-        // SAFETY: as above.
-        unsafe { H::widen(from, part) }
+    fn widen(simd: S, words: S::I32, part: usize) -> S::F32 {
+        T::widen(simd, words, part)
     }
 
     #[inline(always)]
-    unsafe fn exp(x: V) -> V {
-        // SAFETY: as above.
-        unsafe { exp_below_zero(x, &EXP2) }
+    fn exp(simd: S, x: S::F32) -> S::F32 {
+        exp_below_zero(simd, x, &EXP2)
     }
 }
 
-/// Products of pairs of bfloat16 in one instruction, summed in float32: queries and probabilities are rounded too.
-pub(super) struct Pairs;
+/// Products of pairs of bfloat16 in one instruction, summed in float32: queries and probabilities are rounded
+/// too.
+pub(super) struct Bf16Products;
 
-impl<S: Simd<Vector = V>, V: Vector> TileArithmetic<S> for Pairs {
+impl<S: Simd> TileArithmetic<S> for Bf16Products {
     const STEP: usize = 2;
     const FACTORS: usize = 1;
-    type Operand = V::Ints;
+    type Factors = S::I32;
+    type Operand = S::I32;
 
     #[inline(always)]
-    unsafe fn store_factors(first: V, second: V, to: *mut f32) {
-        // SAFETY: the trait's contract; so throughout.
-        unsafe { S::Dots::store_bf16(first, second, to.cast()) }
+    fn factors(simd: S, first: S::F32, second: S::F32) -> S::I32 {
+        simd.to_bf16_pairs(first, second)
     }
 
     #[inline(always)]
-    unsafe fn add_factors(sum: V, _: V, _: V, kept: *const f32) -> V {
+    fn add(simd: S, sum: S::F32, _: S::F32, _: S::F32, factors: S::I32) -> S::F32 {
         /// Two times 1 in bfloat16.
         const ONES: i32 = 0x3f80_3f80;
-        // SAFETY: as above.
-        unsafe { S::Dots::bf16(sum, V::load_ints(kept.cast()), V::splat_int(ONES)) }
+        simd.dot_bf16(sum, factors, simd.splat_i32(ONES))
     }
 
     #[inline(always)]
-    unsafe fn element(factors: *const f32, index: usize) -> f32 {
-        // SAFETY: as above.
-        bf16::from_bits(unsafe { *factors.cast::<u16>().add(index) }).to_f32()
+    fn element(factors: &[f32], index: usize) -> f32 {
+        let bits = factors[index / 2].to_bits() >> (16 * (index % 2));
+        bf16::from_bits(bits as u16).to_f32()
     }
 
     #[inline(always)]
-    unsafe fn broadcast(from: *const f32) -> V::Ints {
-        // SAFETY: as above.
-        unsafe { V::splat_int(*from.cast()) }
+    fn broadcast(simd: S, word: u32) -> S::I32 {
+        simd.splat_i32(word.cast_signed())
     }
 
     #[inline(always)]
-    unsafe fn column(from: *const u32, _: usize) -> V::Ints {
-        // SAFETY: as above.
-        unsafe { V::load_ints(from.cast()) }
+    fn operand(_: S, factors: S::I32) -> S::I32 {
+        factors
     }
 
     #[inline(always)]
-    unsafe fn multiply_add(factor: V::Ints, column: V::Ints, sum: V) -> V {
-        // SAFETY: as above.
-        unsafe { S::Dots::bf16(sum, factor, column) }
+    fn column(_: S, words: S::I32, _: usize) -> S::I32 {
+        words
     }
 
     #[inline(always)]
-    unsafe fn four(from: *const f32) -> V::Ints {
-        // SAFETY: as above.
-        unsafe { V::load_ints(from.cast()) }
+    fn multiply_add(simd: S, factor: S::I32, column: S::I32, sum: S::F32) -> S::F32 {
+        simd.dot_bf16(sum, factor, column)
     }
 
     #[inline(always)]
-    unsafe fn multiply_add_lane<const LANE: i32>(factors: V::Ints, column: V::Ints, sum: V) -> V {
-        // SAFETY: as above.
-        unsafe { S::Dots::bf16_lane::<LANE>(sum, column, factors) }
+    fn multiply_add_lane<const LANE: i32>(simd: S, factors: S::I32, column: S::I32, sum: S::F32) -> S::F32 {
+        simd.dot_bf16_lane::<LANE>(sum, column, factors)
     }
 
     #[inline(always)]
-    unsafe fn widen(from: *const u32, part: usize) -> V {
-        // SAFETY: as above.
-        unsafe { HeldBf16::widen(from, part) }
+    fn widen(simd: S, words: S::I32, part: usize) -> S::F32 {
+        StoredBf16::widen(simd, words, part)
     }
 
     #[inline(always)]
-    unsafe fn exp(x: V) -> V {
-        // SAFETY: as above.
-        unsafe { exp_below_zero(x, &EXP2_FOR_BF16) }
+    fn exp(simd: S, x: S::F32) -> S::F32 {
+        exp_below_zero(simd, x, &EXP2_FOR_BF16)
     }
 }

@@ -2,18 +2,17 @@
 
 use std::sync::atomic::{AtomicBool, Ordering};
 
-use super::pack::{Head, Pack, PairHead, WordHead};
+use super::pack::{Head, PackBf16, PackF32};
 use crate::aligned::{AlignedBuffer, AllocError, elements};
 use crate::isa::Isa;
+use crate::parts::threads_and_tasks;
 use crate::pool::parallel_for;
-use crate::rows::Rows;
+use crate::rows::{Rows, RowsMut, SharedRows};
 use crate::tiles::{MAX_ROWS, TILE};
 use crate::weights::Element;
 
-/// Elements from which packing on a second thread pays.
-const ELEMENTS_FOR_THREADS: usize = 1 << 16;
-
-/// Keys and values of one sequence, all heads, in the layout that [`attention`](crate::attention()) reads.
+/// Keys and values of one sequence, all heads, in the layout that [`attention`](crate::attention()) reads: a
+/// KV cache.
 ///
 /// ```
 /// use saccade_vla_kernels::{Element, Isa, PackedKeyValues, Rows};
@@ -30,26 +29,30 @@ pub struct PackedKeyValues {
     len: usize,
     /// Keys that each head has room for.
     capacity: usize,
-    /// `[head][vector of keys][step of head_dim][lane]`; lanes beyond the last key are zero. A word is an f32, or a pair of bf16, the
-    /// even element in its low half: then a step is two elements, and an odd `head_dim` is padded with zero. In tiles the steps of keys, and
-    /// the steps of `head_dim`, are padded to multiples of 16.
+    /// `[head][vector of keys][step of head_dim][lane]`; lanes beyond the last key are zero. A word is an
+    /// f32, or a pair of bf16, the even element in its low half: then a step is two elements, and an odd
+    /// `head_dim` is padded with zero. In tiles the steps of keys, and the steps of `head_dim`, are padded to
+    /// multiples of 16.
     keys: AlignedBuffer<u32>,
-    /// `[head][step of keys][head_dim]`, each row padded with zeros to whole vectors; words as in `keys`, pairs being of two keys.
+    /// `[head][step of keys][head_dim]`, each row padded with zeros to whole vectors; words as in `keys`,
+    /// pairs being of two keys.
     values: AlignedBuffer<u32>,
     /// Zero times any value is zero: removed keys need no care in the product.
     finite: bool,
 }
 
 impl PackedKeyValues {
-    /// Holds no key yet. Keys and values will be held as `element`s: as they come, or rounded to bfloat16 in half the memory.
+    /// An empty KV cache. Keys and values will be stored as `element`s: as they come, or rounded to bfloat16
+    /// in half the memory.
     ///
     /// # Panics
-    /// If this CPU lacks `isa`, `head_dim` is 0, `num_kv_heads * head_dim` is more than memory can have, or `element` is neither
-    /// [`Element::F32`] nor [`Element::Bf16`].
+    /// If this CPU lacks `isa`, `head_dim` is 0, `num_kv_heads * head_dim` is more than memory can have, or
+    /// `element` is neither [`Element::F32`] nor [`Element::Bf16`].
     #[must_use]
     pub fn new(isa: Isa, element: Element, num_kv_heads: usize, head_dim: usize) -> Self {
         assert!(head_dim > 0, "head_dim: expected at least 1");
-        // The sizes of a head and of all of them are multiplied without checks from here on, and padded by less than the 2 bits left.
+        // The sizes of a head and of all of them are multiplied without checks from here on, and padded by
+        // less than the 2 bits left.
         assert!(
             num_kv_heads
                 .max(1)
@@ -76,8 +79,8 @@ impl PackedKeyValues {
         }
     }
 
-    /// Replaces what is held by `keys` and `values`, `(len, num_kv_heads * head_dim)` each, row-major with any row stride.
-    /// Memory is claimed only if this needs more than ever before.
+    /// Replaces what is held by `keys` and `values`, `(len, num_kv_heads * head_dim)` each, row-major with
+    /// any row stride. Memory is claimed only if this needs more than ever before.
     ///
     /// # Errors
     /// [`AllocError`] if there is not enough memory; nothing is held then.
@@ -95,7 +98,8 @@ impl PackedKeyValues {
         Ok(())
     }
 
-    /// Replaces the keys and values from number `first` on, all of them to the end, as [`Self::pack`] does; those before it stay.
+    /// Replaces the keys and values from number `first` on, all of them to the end, as [`Self::pack`] does;
+    /// those before it stay.
     ///
     /// # Panics
     /// If a shape does not fit.
@@ -124,39 +128,39 @@ impl PackedKeyValues {
             self.keys_of_head(self.capacity),
             self.values_of_head(self.capacity),
         );
+        let (key_steps, value_group) = (self.key_steps(), self.value_group());
+        let (isa, element, heads, head_dim) = (self.isa, self.element, self.num_kv_heads, self.head_dim);
+        let keys_to = SharedRows::new(RowsMut::strided(&mut self.keys, heads, keys_size, keys_size));
+        let values_to = SharedRows::new(RowsMut::strided(
+            &mut self.values,
+            heads,
+            values_size,
+            values_size,
+        ));
         let finite = AtomicBool::new(true);
-        let job = Pack {
-            keys,
-            values,
-            first,
-            keys_to: self.keys.as_mut_ptr(),
-            values_to: self.values.as_mut_ptr(),
-            head_dim: self.head_dim,
-            key_steps: self.key_steps(),
-            value_group: self.value_group(),
-        };
-        let (isa, element) = (self.isa, self.element);
-        let threads = if rows.saturating_mul(width) < ELEMENTS_FOR_THREADS / 2 {
-            1
-        } else {
-            threads
-        };
-        parallel_for(threads, self.num_kv_heads, &|head| {
-            // SAFETY: heads write their own parts of the two buffers, which have room for all of them.
-            let head = unsafe {
-                Head {
-                    job: &job,
-                    head,
-                    keys_to: std::slice::from_raw_parts_mut(job.keys_to.add(head * keys_size), keys_size),
-                    values_to: std::slice::from_raw_parts_mut(
-                        job.values_to.add(head * values_size),
-                        values_size,
-                    ),
-                }
+        // Keys and values.
+        let (threads, _) = threads_and_tasks(threads, rows.saturating_mul(2), width, heads);
+        parallel_for(threads, heads, &|head| {
+            // SAFETY: each head is one task, which runs once.
+            let (mut keys_to, mut values_to) = unsafe {
+                (
+                    keys_to.block(head..head + 1, 0..keys_size),
+                    values_to.block(head..head + 1, 0..values_size),
+                )
+            };
+            let columns = head * head_dim..(head + 1) * head_dim;
+            let head = Head {
+                keys: keys.columns(columns.clone()),
+                values: values.columns(columns),
+                first,
+                key_steps,
+                value_group,
+                keys_to: keys_to.row_mut(0),
+                values_to: values_to.row_mut(0),
             };
             let head_is_finite = match element {
-                Element::Bf16 => isa.run(PairHead(head)),
-                _ => isa.run(WordHead(head)),
+                Element::Bf16 => isa.run(PackBf16(head)),
+                _ => isa.run(PackF32(head)),
             };
             if !head_is_finite {
                 finite.store(false, Ordering::Relaxed);

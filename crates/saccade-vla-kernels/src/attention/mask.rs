@@ -1,8 +1,10 @@
 //! What a query may attend to: every key, those up to its own position, or what a bias on the logits leaves.
 
-/// What is added to the logits: element `(head, query, key)` is `values[head * head_stride + query * query_stride + key]`.
+/// What is added to the logits: element `(head, query, key)` is
+/// `values[head * head_stride + query * query_stride + key]`.
 ///
-/// A stride of 0 repeats a row. `f32::NEG_INFINITY` removes a key: then neither the key nor its value has any influence.
+/// A stride of 0 repeats a row. `f32::NEG_INFINITY` removes a key: then neither the key nor its value has any
+/// influence.
 #[derive(Clone, Copy, Debug)]
 pub struct LogitBias<'a> {
     /// Rows of one element per key.
@@ -19,11 +21,11 @@ pub enum Mask<'a> {
     /// All of them.
     #[default]
     None,
-    /// Query number `i` attends to keys `0 ..= offset + i`, as far as there are keys. What this removes is not computed, and a query's
-    /// result has the same bits whatever comes after its last key.
+    /// Query number `i` attends to keys `0 ..= offset + i`, as far as there are keys. What this removes is
+    /// not computed, and a query's result has the same bits whatever comes after its last key.
     Causal {
-        /// Keys before the first query's own: 0 where queries and keys are the same rows; the length of the prefix where keys of earlier
-        /// rows are cached.
+        /// Keys before the first query's own: 0 where queries and keys are the same rows; the length of the
+        /// prefix where keys of earlier rows are cached.
         offset: usize,
     },
     /// Those that the bias does not remove.
@@ -37,7 +39,8 @@ impl<'a> From<Option<LogitBias<'a>>> for Mask<'a> {
 }
 
 impl Mask<'_> {
-    /// How many of the first `len` keys come before the first one that no query up to number `query` attends to.
+    /// How many of the first `len` keys come before the first one that no query up to number `query` attends
+    /// to.
     #[inline(always)]
     pub(super) fn visible(&self, query: usize, len: usize) -> usize {
         match self {

@@ -1,37 +1,41 @@
-//! Fused attention: scores, bias, stable softmax and the value product, block of keys by block of keys, in registers and on the stack.
+//! Fused attention: scores, bias, stable softmax and the product with the values, block of keys by block of
+//! keys, in registers and on the stack.
 //!
-//! Keys are packed vectors of keys wide and `head_dim`-major, so that scores of many keys come from one broadcast query element; values stay
-//! key-major. Both products are the same register tile, or tiles of a unit for them. Softmax runs over fixed blocks of keys with a running maximum and sum
-//! for each query, so that a query's bits depend on its row, the keys and the instruction set only.
+//! Keys are packed vectors of keys wide and `head_dim`-major, so that scores of many keys come from one
+//! broadcast query element; values stay key-major. Both products are the same micro-kernel, or tiles of a
+//! unit for them. Softmax runs over fixed blocks of keys with a running maximum and sum for each query, so
+//! that a query's bits depend on its row, the keys and the instruction set only.
 
 mod arithmetic;
 mod keys_values;
 mod mask;
 mod pack;
 mod product;
+mod queries;
 mod softmax;
-mod tile;
 
 use crate::parts::part;
 use crate::pool::parallel_for;
-use crate::rows::{Rows, RowsMut};
+use crate::rows::{Rows, RowsMut, SharedRows};
 use crate::weights::Element;
 pub use keys_values::PackedKeyValues;
 pub use mask::{LogitBias, Mask};
-use tile::{Bf16Tile, Call, FloatTile, QueryTile, UnitTile};
+use queries::{AttendBf16, AttendF32, AttendInTiles, QueryBlock};
 
 /// Multiply-adds from which a second thread pays: some 10 us of one core.
 const MACS_FOR_THREADS: usize = 1 << 19;
 
-/// `out[q] = softmax(q K^T * scale + bias) V` for each head, heads side by side, over the keys that `mask` leaves.
+/// `out[q] = softmax(q K^T * scale + bias) V` for each head, heads side by side, over the keys that `mask`
+/// leaves.
 ///
-/// `queries` and `out` are `(queries, num_heads * head_dim)`. The keys have as many heads, or a divisor of it: then groups of
-/// `num_heads / num_kv_heads` consecutive heads share a head of the keys and values (grouped-query attention). A query with no key left gets
-/// zeros. `weights`, if given, is `(num_heads, queries, len)` and receives the probabilities; otherwise they are never in memory together.
+/// `queries` and `out` are `(queries, num_heads * head_dim)`. The keys have as many heads, or a divisor of
+/// it: then groups of `num_heads / num_kv_heads` consecutive heads share a head of the keys and values
+/// (grouped-query attention). A query with no key left gets zeros. `weights`, if given, is
+/// `(num_heads, queries, len)` and receives the probabilities; otherwise they are never in memory together.
 ///
-/// Sums and the softmax are float32. Where pairs of bfloat16 are multiplied, by vectors or in tiles, and `kv` holds them, queries and probabilities are rounded to
-/// bfloat16 too, the sum of a query's probabilities is that of the rounded ones, and denormals may count as zero; elsewhere nothing but
-/// `kv` is rounded.
+/// Sums and the softmax are float32. Where pairs of bfloat16 are multiplied, by vectors or in tiles, and `kv`
+/// holds them, queries and probabilities are rounded to bfloat16 too, the sum of a query's probabilities is
+/// that of the rounded ones, and denormals may count as zero; elsewhere nothing but `kv` is rounded.
 ///
 /// # Panics
 /// If a shape does not fit.
@@ -53,7 +57,7 @@ pub fn attention(
     scale: f32,
     mask: Mask<'_>,
     weights: Option<&mut [f32]>,
-    mut out: RowsMut<'_>,
+    out: RowsMut<'_>,
 ) {
     let (rows, width) = (queries.num_rows(), queries.num_columns());
     let num_heads = width / kv.head_dim();
@@ -84,44 +88,48 @@ pub fn attention(
         return;
     }
     mask.check(num_heads, rows, kv.len());
-    let call = Call {
-        kv,
-        heads_per_kv_head: num_heads / kv.num_kv_heads(),
-        queries: queries.as_ptr(),
-        queries_stride: queries.row_stride() as isize,
-        rows,
-        scale,
-        mask,
-        weights: weights.map(<[f32]>::as_mut_ptr),
-        out_stride: out.row_stride() as isize,
-        out: out.as_mut_ptr(),
-    };
-    let tiles = rows.div_ceil(kv.tile_rows());
-    let macs = rows
-        .saturating_mul(kv.len())
-        .saturating_mul(width)
-        .saturating_mul(2);
+    let (head_dim, len) = (kv.head_dim(), kv.len());
+    let weights = weights.map(|weights| RowsMut::strided(weights, num_heads * rows, len, len));
+    let (out, weights) = (SharedRows::new(out), weights.map(SharedRows::new));
+    let blocks = rows.div_ceil(kv.tile_rows());
+    let macs = rows.saturating_mul(len).saturating_mul(width).saturating_mul(2);
     let threads = if macs < MACS_FOR_THREADS { 1 } else { threads };
-    // Tiles of one head follow each other: its keys and values are then in the caches of all threads.
-    parallel_for(threads, num_heads * tiles, &|task| {
-        let (head, tile) = (task / tiles, task % tiles);
-        // Rows are dealt evenly: 49 are 7 tiles of 7, not 6 of 8 and one of 1.
-        let of_tile = part(rows, tile, tiles);
-        let tile = QueryTile {
-            call: &call,
+    // Blocks of one head follow each other: its keys and values are then in the caches of all threads.
+    parallel_for(threads, num_heads * blocks, &|task| {
+        let (head, block) = (task / blocks, task % blocks);
+        // Rows are dealt evenly: 49 are 7 blocks of 7, not 6 of 8 and one of 1.
+        let rows_of_block = part(rows, block, blocks);
+        let columns = head * head_dim..(head + 1) * head_dim;
+        let weights_of_block = head * rows + rows_of_block.start..head * rows + rows_of_block.end;
+        // SAFETY: each task has a head and a part of the rows that no other has, and runs once.
+        let (out, weights) = unsafe {
+            (
+                out.block(rows_of_block.clone(), columns.clone()),
+                weights
+                    .as_ref()
+                    .map(|weights| weights.block(weights_of_block, 0..len)),
+            )
+        };
+        let block = QueryBlock {
+            kv,
+            queries: queries.rows(rows_of_block.clone()).columns(columns),
+            scale,
+            mask: &mask,
             head,
-            first: of_tile.start,
-            rows: of_tile.len(),
+            kv_head: head / (num_heads / kv.num_kv_heads()),
+            first: rows_of_block.start,
+            out,
+            weights,
         };
         match kv.element() {
-            Element::Bf16 if kv.isa().has_tiles() => kv.isa().run_tiles(UnitTile(&tile)),
-            Element::Bf16 => kv.isa().run(Bf16Tile(&tile)),
-            _ => kv.isa().run(FloatTile(&tile)),
+            Element::Bf16 if kv.isa().has_tiles() => kv.isa().run_tiles(AttendInTiles(block)),
+            Element::Bf16 => kv.isa().run(AttendBf16(block)),
+            _ => kv.isa().run(AttendF32(block)),
         }
     });
 }
 
-/// Whether `len` elements are an array of these sizes. Tasks write to it through pointers, so a product that wraps must not pass.
+/// Whether `len` elements are an array of these sizes. A product that wraps must not pass.
 fn holds(len: usize, sizes: [usize; 3]) -> bool {
     let product = sizes
         .iter()

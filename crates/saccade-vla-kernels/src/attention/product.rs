@@ -1,14 +1,14 @@
-//! The product of a tile: a few rows of factors by vectors of keys or values, in registers.
+//! The products of attention: a few rows of factors by vectors of keys or values, in registers.
 
 use std::marker::PhantomData;
 
-use super::arithmetic::{Float32, Pairs, Stored, TileArithmetic};
+use super::arithmetic::{Bf16Products, Float32Products, Stored, TileArithmetic};
 use super::mask::Mask;
-use crate::simd::{Kernel, Simd, Vector};
+use crate::simd::{Kernel, Simd};
 use crate::tiles::{Ahead, MAX_COLUMN_TILES, Operation, Product, Session, TILE, TileUnit};
 
-/// `out[r][v] (+)= sum over k of a[r][k] b[k][v]`: few rows, and vectors for columns.
-pub(super) struct TileProduct {
+/// The operands of `out[r][v] (+)= sum over k of a[r][k] b[k][v]`: few rows, and vectors for columns.
+pub(super) struct Operands {
     pub rows: usize,
     /// `a`, as factors.
     pub factors: *const f32,
@@ -28,49 +28,51 @@ pub(super) struct TileProduct {
     pub add: bool,
 }
 
-/// What makes the products of a tile whose factors are `A`'s.
+/// A product whose operands exist.
+pub(super) struct AttentionProduct(Operands);
+
+/// What makes the products of queries or probabilities that are `A`'s factors.
 pub(super) trait Multiply<S: Simd, A> {
-    /// Blocks of keys begin at multiples of so many.
+    /// Blocks of keys begin at multiples of so many, and operands are in whole steps of so many elements.
     const KEYS: usize;
 
-    /// # Safety
-    /// As [`TileProduct::run`].
-    unsafe fn multiply(&mut self, simd: S, product: &TileProduct);
+    fn multiply(&mut self, simd: S, product: &AttentionProduct);
 }
 
-/// Vectors. Their products are a piece of code of their own for each arithmetic: their tiles are many, and compilers take minutes over them.
+/// Vectors. Their products are a piece of code of their own for each arithmetic: their tiles are many, and
+/// compilers take minutes over them.
 pub(super) struct InVectors;
 
-impl<S: Simd, H: Stored> Multiply<S, Float32<H>> for InVectors {
-    const KEYS: usize = S::Vector::LANES;
+impl<S: Simd, T: Stored> Multiply<S, Float32Products<T>> for InVectors {
+    const KEYS: usize = S::LANES;
 
     #[inline(always)]
-    unsafe fn multiply(&mut self, simd: S, product: &TileProduct) {
-        let held = PhantomData::<H>;
-        simd.run(FloatProduct { product, held });
+    fn multiply(&mut self, simd: S, product: &AttentionProduct) {
+        let stored = PhantomData::<T>;
+        simd.run(InFloat32 { product, stored });
     }
 }
 
-impl<S: Simd> Multiply<S, Pairs> for InVectors {
-    const KEYS: usize = S::Vector::LANES;
+impl<S: Simd> Multiply<S, Bf16Products> for InVectors {
+    const KEYS: usize = S::LANES;
 
     #[inline(always)]
-    unsafe fn multiply(&mut self, simd: S, product: &TileProduct) {
-        simd.run(PairProduct(product));
+    fn multiply(&mut self, simd: S, product: &AttentionProduct) {
+        simd.run(InBf16(product));
     }
 }
 
-/// Tiles, where vectors have as many lanes. Factors and what they multiply hold zeros to whole steps.
-impl<S: Simd, U: TileUnit> Multiply<S, Pairs> for Session<U> {
+/// Tiles, where vectors have as many lanes.
+impl<S: Simd, U: TileUnit> Multiply<S, Bf16Products> for Session<U> {
     const KEYS: usize = TILE * Operation::Bf16.per_word();
 
     #[inline(always)]
-    unsafe fn multiply(&mut self, _: S, product: &TileProduct) {
-        const { assert!(S::Vector::LANES == TILE) }
+    fn multiply(&mut self, _: S, AttentionProduct(product): &AttentionProduct) {
+        const { assert!(S::LANES == TILE) }
         let mut first = 0;
         while first < product.vectors {
             let columns = columns_at_once(product, product.vectors - first);
-            // SAFETY: the caller's promise.
+            // SAFETY: `AttentionProduct::new` was promised that the operands exist, in whole steps.
             unsafe {
                 self.multiply(&Product {
                     operation: Operation::Bf16,
@@ -82,7 +84,7 @@ impl<S: Simd, U: TileUnit> Multiply<S, Pairs> for Session<U> {
                     w_column: product.b_vector,
                     w_step: TILE * product.b_step,
                     columns,
-                    steps: product.depth.div_ceil(<Self as Multiply<S, Pairs>>::KEYS),
+                    steps: product.depth.div_ceil(<Self as Multiply<S, Bf16Products>>::KEYS),
                     sums: product.out.add(first * TILE).cast(),
                     sums_stride: product.out_stride,
                     add: product.add,
@@ -94,8 +96,9 @@ impl<S: Simd, U: TileUnit> Multiply<S, Pairs> for Session<U> {
     }
 }
 
-/// How many of the `left` tiles of columns a unit takes at once: as many products in flight as its tiles of sums allow.
-fn columns_at_once(product: &TileProduct, left: usize) -> usize {
+/// How many of the `left` tiles of columns a unit takes at once: as many products in flight as its tiles of
+/// sums allow.
+fn columns_at_once(product: &Operands, left: usize) -> usize {
     match left {
         _ if product.rows <= TILE => left.div_ceil(left.div_ceil(MAX_COLUMN_TILES)),
         // Not 3 and 1: a single column waits for each of its products.
@@ -104,138 +107,133 @@ fn columns_at_once(product: &TileProduct, left: usize) -> usize {
     }
 }
 
-struct FloatProduct<'a, H> {
-    product: &'a TileProduct,
-    held: PhantomData<H>,
+/// The product in float32, with `b` stored as `T`.
+struct InFloat32<'a, T> {
+    product: &'a AttentionProduct,
+    stored: PhantomData<T>,
 }
 
-impl<H: Stored> Kernel for FloatProduct<'_, H> {
+impl<T: Stored> Kernel for InFloat32<'_, T> {
     type Output = ();
 
     #[inline(always)]
-    fn run<S: Simd>(self, _: S) {
-        // SAFETY: the promise to `Multiply::multiply`.
-        unsafe { self.product.run::<S, Float32<H>>() }
+    fn run<S: Simd>(self, simd: S) {
+        self.product.run::<S, Float32Products<T>>(simd);
     }
 }
 
-struct PairProduct<'a>(&'a TileProduct);
+/// The product in pairs of bfloat16.
+struct InBf16<'a>(&'a AttentionProduct);
 
-impl Kernel for PairProduct<'_> {
+impl Kernel for InBf16<'_> {
     type Output = ();
 
     #[inline(always)]
-    fn run<S: Simd>(self, _: S) {
-        // SAFETY: the promise to `Multiply::multiply`.
-        unsafe { self.0.run::<S, Pairs>() }
+    fn run<S: Simd>(self, simd: S) {
+        self.0.run::<S, Bf16Products>(simd);
     }
 }
 
-impl TileProduct {
-    /// All of it.
-    ///
+impl AttentionProduct {
     /// # Safety
-    /// The pointers are valid for all rows, at most `TILE_ROWS`, for `depth` elements in whole steps and for all vectors; called within
-    /// [`Simd::run`] of `S`.
+    /// For as long as the product is used, with the arithmetic and the multiplier that it is used with:
+    /// - `factors` points to `rows` rows, `factors_stride` apart, of the factors of `depth` elements;
+    /// - `b` points to `vectors` vectors of words, `b_vector` apart, for each step over `depth` elements,
+    ///   `b_step` apart;
+    /// - both are initialised to whole steps of [`Multiply::KEYS`] elements where tiles multiply, with zeros
+    ///   beyond `depth`;
+    /// - `out` points to `rows` rows, `out_stride` apart, of `vectors` vectors, which nothing else reads or
+    ///   writes; they are initialised if `add` is set.
+    pub(super) unsafe fn new(operands: Operands) -> Self {
+        Self(operands)
+    }
+
+    /// All of it, for at most `TILE_ROWS` rows.
     #[inline(always)]
-    unsafe fn run<S: Simd, A: TileArithmetic<S>>(&self) {
-        // SAFETY: the caller's promise.
-        unsafe {
-            match self.rows {
-                1 => self.all::<S, A, 1>(),
-                2 => self.all::<S, A, 2>(),
-                3 => self.all::<S, A, 3>(),
-                4 => self.all::<S, A, 4>(),
-                5 if S::Vector::TILE_ROWS >= 5 => self.all::<S, A, 5>(),
-                6 if S::Vector::TILE_ROWS >= 6 => self.all::<S, A, 6>(),
-                7 if S::Vector::TILE_ROWS >= 7 => self.all::<S, A, 7>(),
-                8 if S::Vector::TILE_ROWS >= 8 => self.all::<S, A, 8>(),
-                rows => unreachable!("a tile of {rows} rows"),
-            }
+    fn run<S: Simd, A: TileArithmetic<S>>(&self, simd: S) {
+        match self.0.rows {
+            1 => self.all::<S, A, 1>(simd),
+            2 => self.all::<S, A, 2>(simd),
+            3 => self.all::<S, A, 3>(simd),
+            4 => self.all::<S, A, 4>(simd),
+            5 if S::TILE_ROWS >= 5 => self.all::<S, A, 5>(simd),
+            6 if S::TILE_ROWS >= 6 => self.all::<S, A, 6>(simd),
+            7 if S::TILE_ROWS >= 7 => self.all::<S, A, 7>(simd),
+            8 if S::TILE_ROWS >= 8 => self.all::<S, A, 8>(simd),
+            rows => unreachable!("a tile of {rows} rows"),
         }
     }
 
     /// All columns of `MR` rows, a few at a time.
-    ///
-    /// # Safety
-    /// As [`Self::run`].
     #[inline(always)]
-    unsafe fn all<S: Simd, A: TileArithmetic<S>, const MR: usize>(&self) {
-        let most = S::Vector::TILE_VECTORS;
-        let groups = self.vectors.div_ceil(most);
+    fn all<S: Simd, A: TileArithmetic<S>, const MR: usize>(&self, simd: S) {
+        let vectors = self.0.vectors;
+        let groups = vectors.div_ceil(S::TILE_VECTORS);
         for group in 0..groups {
-            let first = self.vectors * group / groups;
-            let end = self.vectors * (group + 1) / groups;
-            // SAFETY: the caller's promise.
-            unsafe {
-                match end - first {
-                    1 => self.tile::<S, S::Vector, A, MR, 1>(first),
-                    2 if most >= 2 => self.tile::<S, S::Vector, A, MR, 2>(first),
-                    3 if most >= 3 => self.tile::<S, S::Vector, A, MR, 3>(first),
-                    4 if most >= 4 => self.tile::<S, S::Vector, A, MR, 4>(first),
-                    vectors => unreachable!("a tile of {vectors} vectors"),
-                }
+            let first = vectors * group / groups;
+            let end = vectors * (group + 1) / groups;
+            match end - first {
+                1 => self.tile::<S, A, MR, 1>(simd, first),
+                2 if S::TILE_VECTORS >= 2 => self.tile::<S, A, MR, 2>(simd, first),
+                3 if S::TILE_VECTORS >= 3 => self.tile::<S, A, MR, 3>(simd, first),
+                4 if S::TILE_VECTORS >= 4 => self.tile::<S, A, MR, 4>(simd, first),
+                vectors => unreachable!("a tile of {vectors} vectors"),
             }
         }
     }
 
-    /// `NV` vectors from `first` on.
-    ///
-    /// # Safety
-    /// As [`Self::run`].
+    /// The micro-kernel: `MR` rows by `NV` vectors from `first` on.
     #[inline(always)]
-    unsafe fn tile<S: Simd<Vector = V>, V: Vector, A: TileArithmetic<S>, const MR: usize, const NV: usize>(
-        &self,
-        first: usize,
-    ) {
-        // SAFETY: the caller's promise.
+    fn tile<S: Simd, A: TileArithmetic<S>, const MR: usize, const NV: usize>(&self, simd: S, first: usize) {
+        let product = &self.0;
+        // SAFETY: `new` was promised that the rows, the vectors and the steps over `depth` exist.
         unsafe {
-            let out = self.out.add(first * V::LANES);
-            let mut acc = [[V::splat(0.0); NV]; MR];
-            if self.add {
-                for (r, row) in acc.iter_mut().enumerate() {
+            let out = product.out.add(first * S::LANES);
+            let mut sums = [[simd.splat(0.0); NV]; MR];
+            if product.add {
+                for (r, row) in sums.iter_mut().enumerate() {
                     for (v, sum) in row.iter_mut().enumerate() {
-                        *sum = V::load(out.add(r * self.out_stride + v * V::LANES));
+                        *sum = simd.load_ptr(out.add(r * product.out_stride + v * S::LANES));
                     }
                 }
             }
-            let mut b = self.b.add(first * self.b_vector);
-            let mut factors = self.factors;
-            let mut steps = self.depth.div_ceil(A::STEP);
-            if V::BY_LANE {
+            let mut b = product.b.add(first * product.b_vector);
+            let mut factors = product.factors.cast::<u32>();
+            let mut steps = product.depth.div_ceil(A::STEP);
+            if S::BY_LANE {
                 for _ in 0..steps * A::FACTORS / 4 {
-                    let mut rows = [A::four(factors); MR];
+                    let mut rows = [A::operand(simd, simd.load_words_ptr(factors)); MR];
                     for (r, row) in rows.iter_mut().enumerate().skip(1) {
-                        *row = A::four(factors.add(r * self.factors_stride));
+                        *row = A::operand(simd, simd.load_words_ptr(factors.add(r * product.factors_stride)));
                     }
-                    self.lane::<S, A, MR, NV, 0>(&mut acc, &rows, b);
-                    self.lane::<S, A, MR, NV, 1>(&mut acc, &rows, b);
-                    self.lane::<S, A, MR, NV, 2>(&mut acc, &rows, b);
-                    self.lane::<S, A, MR, NV, 3>(&mut acc, &rows, b);
-                    b = b.wrapping_add(4 / A::FACTORS * self.b_step);
+                    self.lane::<S, A, MR, NV, 0>(simd, &mut sums, &rows, b);
+                    self.lane::<S, A, MR, NV, 1>(simd, &mut sums, &rows, b);
+                    self.lane::<S, A, MR, NV, 2>(simd, &mut sums, &rows, b);
+                    self.lane::<S, A, MR, NV, 3>(simd, &mut sums, &rows, b);
+                    b = b.wrapping_add(4 / A::FACTORS * product.b_step);
                     factors = factors.wrapping_add(4);
                 }
                 steps %= 4 / A::FACTORS;
             }
             for _ in 0..steps {
                 for part in 0..A::FACTORS {
-                    let mut columns = [A::column(b, part); NV];
+                    let mut columns = [A::column(simd, simd.load_words_ptr(b), part); NV];
                     for (v, column) in columns.iter_mut().enumerate().skip(1) {
-                        *column = A::column(b.add(v * self.b_vector), part);
+                        *column = A::column(simd, simd.load_words_ptr(b.add(v * product.b_vector)), part);
                     }
-                    for (r, row) in acc.iter_mut().enumerate() {
-                        let factor = A::broadcast(factors.add(r * self.factors_stride + part));
+                    for (r, row) in sums.iter_mut().enumerate() {
+                        let factor = A::broadcast(simd, *factors.add(r * product.factors_stride + part));
                         for (sum, &column) in row.iter_mut().zip(&columns) {
-                            *sum = A::multiply_add(factor, column, *sum);
+                            *sum = A::multiply_add(simd, factor, column, *sum);
                         }
                     }
                 }
-                b = b.wrapping_add(self.b_step);
+                b = b.wrapping_add(product.b_step);
                 factors = factors.wrapping_add(A::FACTORS);
             }
-            for (r, row) in acc.iter().enumerate() {
+            for (r, row) in sums.iter().enumerate() {
                 for (v, sum) in row.iter().enumerate() {
-                    sum.store(out.add(r * self.out_stride + v * V::LANES));
+                    simd.store_ptr(*sum, out.add(r * product.out_stride + v * S::LANES));
                 }
             }
         }
@@ -244,55 +242,52 @@ impl TileProduct {
     /// Adds the products of factor number `LANE` of four of each row and what it meets from `b` on.
     ///
     /// # Safety
-    /// As [`Self::run`], for the steps of four factors from `b` on.
+    /// `b` points to the steps of these four factors.
     #[inline(always)]
     unsafe fn lane<S: Simd, A: TileArithmetic<S>, const MR: usize, const NV: usize, const LANE: i32>(
         &self,
-        acc: &mut [[S::Vector; NV]; MR],
+        simd: S,
+        sums: &mut [[S::F32; NV]; MR],
         rows: &[A::Operand; MR],
         b: *const u32,
     ) {
         let (step, part) = (LANE as usize / A::FACTORS, LANE as usize % A::FACTORS);
-        // SAFETY: the caller's promise.
-        unsafe {
-            let b = b.add(step * self.b_step);
-            for v in 0..NV {
-                let column = A::column(b.add(v * self.b_vector), part);
-                for (row, &factors) in acc.iter_mut().zip(rows) {
-                    row[v] = A::multiply_add_lane::<LANE>(factors, column, row[v]);
-                }
+        for v in 0..NV {
+            // SAFETY: the step exists, and `new` was promised that the vectors do.
+            let words = unsafe { simd.load_words_ptr(b.add(step * self.0.b_step + v * self.0.b_vector)) };
+            let column = A::column(simd, words, part);
+            for (row, &factors) in sums.iter_mut().zip(rows) {
+                row[v] = A::multiply_add_lane::<LANE>(simd, factors, column, row[v]);
             }
         }
     }
 
-    /// Adds as [`Self::run`] does, where values are not all finite: keys that the mask removes are passed over, because zero times infinity
-    /// is not zero.
-    ///
-    /// # Safety
-    /// As [`Self::run`].
+    /// Adds the product where values are not all finite: keys that the mask removes are passed over, because
+    /// zero times infinity is not zero.
     #[inline(always)]
-    pub(super) unsafe fn without_removed<S: Simd<Vector = V>, V: Vector, A: TileArithmetic<S>>(
-        &self,
-        removed: &Removed<'_>,
-    ) {
-        for r in 0..self.rows {
+    pub(super) fn add_without_removed<S: Simd, A: TileArithmetic<S>>(&self, simd: S, removed: &Removed<'_>) {
+        let product = &self.0;
+        let words = product.depth.div_ceil(A::STEP) * A::FACTORS;
+        for r in 0..product.rows {
             let query = removed.first_query + r;
             let bias = removed.mask.bias(removed.head, query, removed.len);
-            let seen = removed.mask.visible(query, removed.len);
-            for k in 0..self.depth.min(seen.saturating_sub(removed.first_key)) {
+            let visible = removed.mask.visible(query, removed.len);
+            // SAFETY: `new` was promised that each row has the factors of `depth` elements.
+            let factors =
+                unsafe { std::slice::from_raw_parts(product.factors.add(r * product.factors_stride), words) };
+            for k in 0..product.depth.min(visible.saturating_sub(removed.first_key)) {
                 if bias.is_some_and(|bias| bias[removed.first_key + k] == f32::NEG_INFINITY) {
                     continue;
                 }
-                // SAFETY: the caller's promise.
-                unsafe {
-                    let factor = V::splat(A::element(self.factors.add(r * self.factors_stride), k));
-                    for v in 0..self.vectors {
-                        let value = A::widen(
-                            self.b.add(k / A::STEP * self.b_step + v * self.b_vector),
-                            k % A::STEP,
-                        );
-                        let at = self.out.add(r * self.out_stride + v * V::LANES);
-                        factor.fma(value, V::load(at)).store(at);
+                let factor = simd.splat(A::element(factors, k));
+                for v in 0..product.vectors {
+                    // SAFETY: `new` was promised that the steps, the rows and the vectors exist, and the sums
+                    // so far.
+                    unsafe {
+                        let words = product.b.add(k / A::STEP * product.b_step + v * product.b_vector);
+                        let value = A::widen(simd, simd.load_words_ptr(words), k % A::STEP);
+                        let at = product.out.add(r * product.out_stride + v * S::LANES);
+                        simd.store_ptr(simd.fma(factor, value, simd.load_ptr(at)), at);
                     }
                 }
             }

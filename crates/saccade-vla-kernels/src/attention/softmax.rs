@@ -2,10 +2,12 @@
 
 use super::arithmetic::TileArithmetic;
 use super::mask::Mask;
-use crate::simd::{MAX_LANES, Simd, Vector, load};
+use crate::simd::bits::write;
+use crate::simd::{MAX_LANES, Simd};
 
-/// Zeros, then -inf: loaded `n` before the middle, `n` lanes stay as they are.
-static SEEN_THEN_REMOVED: [f32; 2 * MAX_LANES] = {
+/// A sliding mask: loaded at `MAX_LANES - n`, it has zeros in the first `n` lanes, which are kept, and `-inf`
+/// in the others.
+static KEEP_THEN_REMOVE: [f32; 2 * MAX_LANES] = {
     let mut lanes = [0.0; 2 * MAX_LANES];
     let mut lane = MAX_LANES;
     while lane < lanes.len() {
@@ -37,139 +39,121 @@ pub(super) struct Row<'a> {
 }
 
 impl Row<'_> {
-    /// The larger of `max` and the largest logit of the block; -inf where there is none. Scores become logits: with the bias, and `-inf` for
-    /// what this query does not see, to whole vectors.
-    ///
-    /// # Safety
-    /// `scores` points to the block's scores in whole vectors; called within [`Simd::run`] with the vectors of `V`.
+    /// The larger of `max` and the largest logit of the block; -inf where there is none. Scores become
+    /// logits: with the bias, and `-inf` for what this query does not attend to, to whole vectors.
     #[inline(always)]
-    pub(super) unsafe fn logits<V: Vector>(&self, scores: *mut f32, max: f32) -> f32 {
+    pub(super) fn logits<S: Simd>(&self, simd: S, scores: &mut [f32], max: f32) -> f32 {
         let bias = self.mask.bias(self.head, self.query, self.len);
-        let bias = bias.map(|bias| bias[self.first..].as_ptr());
-        // Those of the block that this query sees; the rest is as if removed.
-        let seen = self.mask.visible(self.query, self.len).saturating_sub(self.first);
-        let seen = seen.min(self.count);
-        let whole = seen - seen % V::LANES;
-        // SAFETY: the caller's promise; the bias has `count` elements from here on.
-        unsafe {
-            let removed = V::splat(f32::NEG_INFINITY);
-            let mut max = V::splat(max);
-            match bias {
-                Some(bias) => {
-                    for i in (0..whole).step_by(V::LANES) {
-                        let bias = V::load(bias.add(i));
-                        let logits = V::load(scores.add(i)).add(bias).replace_where(bias, removed);
-                        logits.store(scores.add(i));
-                        max = logits.max(max);
-                    }
-                }
-                None => {
-                    // Four at a time, so that they need not wait for each other.
-                    let mut others = [removed; 4];
-                    let fours = whole - whole % (4 * V::LANES);
-                    for i in (0..fours).step_by(4 * V::LANES) {
-                        for (other, vector) in others.iter_mut().zip(0..) {
-                            *other = V::load(scores.add(i + vector * V::LANES)).max(*other);
-                        }
-                    }
-                    for i in (fours..whole).step_by(V::LANES) {
-                        max = V::load(scores.add(i)).max(max);
-                    }
-                    let [a, b, c, d] = others;
-                    max = max.max(a.max(b)).max(c.max(d));
+        let bias = bias.map(|bias| &bias[self.first..][..self.count]);
+        // Keys of the block that this query attends to; the rest is as if removed.
+        let visible = self.mask.visible(self.query, self.len).saturating_sub(self.first);
+        let visible = visible.min(self.count);
+        let (whole, rest) =
+            scores[..self.count.next_multiple_of(S::LANES)].split_at_mut(visible - visible % S::LANES);
+        let removed = simd.splat(f32::NEG_INFINITY);
+        let mut max = simd.splat(max);
+        match bias {
+            Some(bias) => {
+                for (scores, bias) in whole.chunks_exact_mut(S::LANES).zip(bias.chunks_exact(S::LANES)) {
+                    let bias = simd.load(bias);
+                    let logits = simd.replace_where(simd.add(simd.load(scores), bias), bias, removed);
+                    simd.store(logits, scores);
+                    max = simd.max(logits, max);
                 }
             }
-            for i in (whole..self.count).step_by(V::LANES) {
-                let seen = seen.saturating_sub(i).min(V::LANES);
-                let mut logits = V::load(scores.add(i));
-                if let Some(bias) = bias {
-                    let bias = load::<V>(bias.add(i), V::LANES.min(self.count - i));
-                    logits = logits.add(bias).replace_where(bias, removed);
+            None => {
+                // Four at a time, so that they need not wait for each other.
+                let mut others = [removed; 4];
+                let mut groups = whole.chunks_exact(4 * S::LANES);
+                for group in &mut groups {
+                    for (other, vector) in others.iter_mut().zip(0..) {
+                        *other = simd.max(simd.load(&group[vector * S::LANES..]), *other);
+                    }
                 }
-                let beyond = V::load(SEEN_THEN_REMOVED.as_ptr().add(MAX_LANES - seen));
-                logits = logits.replace_where(beyond, removed);
-                logits.store(scores.add(i));
-                max = logits.max(max);
+                for scores in groups.remainder().chunks_exact(S::LANES) {
+                    max = simd.max(simd.load(scores), max);
+                }
+                let [a, b, c, d] = others;
+                max = simd.max(simd.max(max, simd.max(a, b)), simd.max(c, d));
             }
-            max.reduce_max()
         }
+        for (vector, scores) in rest.chunks_exact_mut(S::LANES).enumerate() {
+            let from = whole.len() + vector * S::LANES;
+            let kept = visible.saturating_sub(from).min(S::LANES);
+            let mut logits = simd.load(scores);
+            if let Some(bias) = bias {
+                let bias = simd.load_partial(&bias[from..]);
+                logits = simd.replace_where(simd.add(logits, bias), bias, removed);
+            }
+            let beyond = simd.load(&KEEP_THEN_REMOVE[MAX_LANES - kept..]);
+            logits = simd.replace_where(logits, beyond, removed);
+            simd.store(logits, scores);
+            max = simd.max(logits, max);
+        }
+        simd.reduce_max(max)
     }
 
-    /// Turns the logits of a block into probabilities relative to the maximum, kept as factors in their place, with zeros to whole pairs of
-    /// vectors. `max` is what [`Self::logits`] gave. Returns the factor by which sums so far change.
-    ///
-    /// # Safety
-    /// `logits` points to the block's logits in whole pairs of vectors, the last of which may be missing; called within [`Simd::run`] of `S`.
+    /// Turns the logits of a block, whole pairs of vectors of which those beyond the last key are any
+    /// numbers, into probabilities relative to the maximum, as factors in their place, with zeros to whole
+    /// pairs of vectors. `max` is what [`Self::logits`] gave. Returns the factor by which sums so far change.
     #[inline(always)]
-    pub(super) unsafe fn softmax<S: Simd<Vector = V>, V: Vector, A: TileArithmetic<S>>(
+    pub(super) fn softmax<S: Simd, A: TileArithmetic<S>>(
         &self,
-        logits: *mut f32,
+        simd: S,
+        logits: &mut [f32],
         max: f32,
         running: &mut Running,
     ) -> f32 {
-        // SAFETY: the caller's promise.
-        unsafe {
-            // All logits so far are -inf: anything finite makes them zeros.
-            let shift = if max == f32::NEG_INFINITY { 0.0 } else { max };
-            // Before the first block there is nothing to change.
-            let rescale = if self.first == 0 {
-                0.0
+        // All logits so far are -inf: anything finite makes them zeros.
+        let shift = if max == f32::NEG_INFINITY { 0.0 } else { max };
+        // Before the first block there is nothing to change.
+        let rescale = if self.first == 0 {
+            0.0
+        } else {
+            first_lane(simd, A::exp(simd, simd.splat(running.max - shift)))
+        };
+        let shift = simd.splat(shift);
+        let mut sum = simd.splat(0.0);
+        for i in (0..self.count).step_by(2 * S::LANES) {
+            let pair = &logits[i..][..2 * S::LANES];
+            let first = A::exp(simd, simd.sub(simd.load(pair), shift));
+            let second = if i + S::LANES < self.count {
+                A::exp(simd, simd.sub(simd.load(&pair[S::LANES..]), shift))
             } else {
-                first_lane(A::exp(V::splat(running.max - shift)))
+                simd.splat(0.0)
             };
-            let shift = V::splat(shift);
-            let mut sum = V::splat(0.0);
-            let vectors = self.count.div_ceil(V::LANES);
-            for vector in (0..vectors).step_by(2) {
-                let i = vector * V::LANES;
-                let first = A::exp(V::load(logits.add(i)).sub(shift));
-                let second = if vector + 1 < vectors {
-                    A::exp(V::load(logits.add(i + V::LANES)).sub(shift))
-                } else {
-                    V::splat(0.0)
-                };
-                let kept = logits.add(i * A::FACTORS / A::STEP);
-                A::store_factors(first, second, kept);
-                // Of what the values are multiplied with, so that the weights of a query add up to 1.
-                sum = A::add_factors(sum, first, second, kept);
-            }
-            *running = Running {
-                max,
-                sum: running.sum * rescale + sum.reduce_add(),
-            };
-            rescale
+            let factors = A::factors(simd, first, second);
+            write(factors, &mut logits[i * A::FACTORS / A::STEP..]);
+            // Of what the values are multiplied with, so that the weights of a query add up to 1.
+            sum = A::add(simd, sum, first, second, factors);
         }
+        *running = Running {
+            max,
+            sum: running.sum * rescale + simd.reduce_add(sum),
+        };
+        rescale
     }
 
     /// Keeps the probabilities of a block as they are used, and rescales those of the blocks before.
-    ///
-    /// # Safety
-    /// `factors` are what [`Self::softmax`] left; `weights` points to an element for every key; called within [`Simd::run`] of `S`.
+    /// `factors` are what [`Self::softmax`] left; `weights` has an element for every key.
     #[inline(always)]
-    pub(super) unsafe fn keep_weights<S: Simd, A: TileArithmetic<S>>(
+    pub(super) fn keep_weights<S: Simd, A: TileArithmetic<S>>(
         &self,
-        factors: *const f32,
+        factors: &[f32],
         rescale: f32,
-        weights: *mut f32,
+        weights: &mut [f32],
     ) {
-        // SAFETY: the caller's promise.
-        unsafe {
-            for key in 0..self.first {
-                *weights.add(key) *= rescale;
-            }
-            for index in 0..self.count {
-                *weights.add(self.first + index) = A::element(factors, index);
-            }
+        let (before, weights) = weights.split_at_mut(self.first);
+        before.iter_mut().for_each(|weight| *weight *= rescale);
+        for (index, weight) in weights[..self.count].iter_mut().enumerate() {
+            *weight = A::element(factors, index);
         }
     }
 }
 
-/// # Safety
-/// Called within [`Simd::run`] with the vectors of `V`.
 #[inline(always)]
-unsafe fn first_lane<V: Vector>(vector: V) -> f32 {
-    let mut lane = 0.0;
-    // SAFETY: one lane, one element.
-    unsafe { vector.store_partial(&raw mut lane, 1) };
-    lane
+fn first_lane<S: Simd>(simd: S, vector: S::F32) -> f32 {
+    let mut lane = [0.0];
+    simd.store_partial(vector, &mut lane);
+    lane[0]
 }

@@ -5,12 +5,14 @@ use crate::parts::parallel_rows;
 use crate::rows::{Rows, RowsMut};
 use crate::simd::{Kernel, Simd};
 
-/// `out = norm(x) * scale + shift`, row by row, with `norm(x) = (x - mean) / sqrt(variance + eps)` over the columns.
+/// `out = norm(x) * scale + shift`, row by row, with `norm(x) = (x - mean) / sqrt(variance + eps)` over the
+/// columns.
 ///
-/// `x` and `out` are `(rows, width)`, row-major with any row stride; `scale` and `shift` have `width` elements and hold
-/// for all rows: the learned affine, or `1 + scale` and `shift` of an adaptive norm. The variance is the mean of squared
-/// distances from the mean, in a second pass over the row, which also finds what rounding has left of the mean: rows far
-/// from zero are as exact as others. A row of zero variance gives `shift`; one with NaN or infinity gives NaN.
+/// `x` and `out` are `(rows, width)`, row-major with any row stride; `scale` and `shift` have `width`
+/// elements and hold for all rows: the learned affine, or `1 + scale` and `shift` of an adaptive norm. The
+/// variance is the mean of squared distances from the mean, in a second pass over the row, which also finds
+/// what rounding has left of the mean: rows far from zero are as exact as others. A row of zero variance
+/// gives `shift`; one with NaN or infinity gives NaN.
 ///
 /// # Panics
 /// If a shape does not fit, or this CPU lacks `isa`.
@@ -106,8 +108,8 @@ impl<S: Simd> Norm<S> {
         let columns = x.len() as f32;
         let (total, _) = sums(simd, x, 0.0);
         let mean = total / columns;
-        // What the distances from the mean add up to is the error of the mean, which matters where the mean is large
-        // compared with them.
+        // What the distances from the mean add up to is the error of the mean, which matters where the mean
+        // is large compared with them.
         let (distances, squares) = sums(simd, x, mean);
         let error = distances / columns;
         let variance = (squares - distances * error) / columns;
@@ -124,7 +126,8 @@ impl<S: Simd> Norm<S> {
     }
 }
 
-/// Sums of `x - centre` and of its squares, in four chains: short ones round less, and do not wait for each other.
+/// Sums of `x - centre` and of its squares, in four chains: short ones round less, and do not wait for each
+/// other.
 #[inline(always)]
 fn sums<S: Simd>(simd: S, x: &[f32], centre: f32) -> (f32, f32) {
     const CHAINS: usize = 4;

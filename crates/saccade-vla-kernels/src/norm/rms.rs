@@ -7,9 +7,10 @@ use crate::simd::{Kernel, Simd};
 
 /// `out = x / sqrt(mean(x^2) + eps) * weight`, the mean over `weight.len()` consecutive columns.
 ///
-/// `x` and `out` are `(rows, width)`. A weight of `width` elements norms whole rows; one of `head_dim` elements norms
-/// each of the `width / head_dim` heads of a row by itself, as query and key norms do. An element's bits depend on its
-/// head alone. A head of zeros gives zeros if `eps` is positive; NaN and infinity give NaN in their head.
+/// `x` and `out` are `(rows, width)`. A weight of `width` elements norms whole rows; one of `head_dim`
+/// elements norms each of the `width / head_dim` heads of a row by itself, as query and key norms do. An
+/// element's bits depend on its head alone. A head of zeros gives zeros if `eps` is positive; NaN and
+/// infinity give NaN in their head.
 ///
 /// # Panics
 /// If a shape does not fit, or this CPU lacks `isa`.

@@ -1,5 +1,7 @@
 //! Vectors and slices as bits: reading, writing and reinterpreting them.
 
+use std::mem::MaybeUninit;
+
 /// Types without padding of which every bit pattern is a value.
 ///
 /// # Safety
@@ -39,6 +41,18 @@ pub(crate) fn read<T: Bits, V: Bits>(from: &[T]) -> V {
     let from = &from[..size_of::<V>() / size_of::<T>()];
     // SAFETY: the slice has the size of the vector, and any bits are one. It may begin anywhere.
     unsafe { from.as_ptr().cast::<V>().read_unaligned() }
+}
+
+/// Writes a vector to the first elements of memory that need not be initialised.
+///
+/// # Panics
+/// If there are fewer than the vector has.
+#[inline(always)]
+#[track_caller]
+pub(crate) fn write_uninit<T: Bits, V: Bits>(vector: V, to: &mut [MaybeUninit<T>]) {
+    let to = &mut to[..size_of::<V>() / size_of::<T>()];
+    // SAFETY: the slice has the size of the vector, and any bits are elements of it. It may begin anywhere.
+    unsafe { to.as_mut_ptr().cast::<V>().write_unaligned(vector) }
 }
 
 /// Writes a vector to the first elements of `to`.

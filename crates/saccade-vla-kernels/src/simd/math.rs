@@ -2,7 +2,8 @@
 
 use super::Simd;
 
-/// `exp(x)`, within 2 ULP of the exact value where that is a normal number, and within one smallest denormal below.
+/// `exp(x)`, within 2 ULP of the exact value where that is a normal number, and within one smallest denormal
+/// below.
 ///
 /// Exactly 0 at `-inf` and below -104, infinity above 88.73, NaN at NaN.
 #[inline(always)]
@@ -11,19 +12,23 @@ fn exp_vector<S: Simd>(simd: S, x: S::F32) -> S::F32 {
     exp_from(simd, x, -105.0)
 }
 
-/// Where `exp(x)` is only added to 1, smaller `x` change nothing. From -87.34 on the exponential is a denormal: tanh-GELU
-/// of a vector with a 10.5 took 91 instead of 5.6 ns with AVX-512, 133 instead of 12 with AVX2 (Emerald Rapids).
+/// Where `exp(x)` is only added to 1, smaller `x` change nothing. From -87.34 on the exponential is a
+/// denormal: tanh-GELU of a vector with a 10.5 took 91 instead of 5.6 ns with AVX-512, 133 instead of 12 with
+/// AVX2 (Emerald Rapids).
 const LEAST_BESIDE_ONE: f32 = -87.0;
 
-/// Where the tail of [`gelu_erf_vector`] ends. It is below 1e-35 there, and still a product of normal numbers.
+/// Where the tail of [`gelu_erf_vector`] ends. It is below 1e-35 there, and still a product of normal
+/// numbers.
 const END_OF_TAIL: f32 = 12.65;
 
 /// `exp(max(x, least))`, as [`exp_vector`]; `least` is at least -105.
 #[inline(always)]
 fn exp_from<S: Simd>(simd: S, x: S::F32, least: f32) -> S::F32 {
-    // Above 89 the result is infinity. The bounds keep the whole part small. The second operand wins if it is NaN.
+    // Above 89 the result is infinity. The bounds keep the whole part small. The second operand wins if it is
+    // NaN.
     let x = simd.max(simd.splat(least), simd.min(simd.splat(89.0), x));
-    // x = n ln 2 + r, |r| <= ln 2 / 2; ln 2 in two parts, of which n times the first is exact (Cody and Waite).
+    // x = n ln 2 + r, |r| <= ln 2 / 2; ln 2 in two parts, of which n times the first is exact (Cody and
+    // Waite).
     let n = simd.round(simd.mul(x, simd.splat(std::f32::consts::LOG2_E)));
     let r = simd.fma(n, simd.splat(-0.693_359_4), x);
     let r = simd.fma(n, simd.splat(2.121_944_4e-4), r);
@@ -64,7 +69,8 @@ fn silu_vector<S: Simd>(simd: S, x: S::F32) -> S::F32 {
 
 /// `0.5 x (1 + tanh(u)) = x / (1 + exp(-2 u))` with `u = sqrt(2 / pi) (x + 0.044715 x^3)`.
 ///
-/// The right form needs no difference of nearly equal numbers, so that it is exact to rounding for negative `x` too.
+/// The right form needs no difference of nearly equal numbers, so that it is exact to rounding for negative
+/// `x` too.
 #[inline(always)]
 fn gelu_tanh_vector<S: Simd>(simd: S, x: S::F32) -> S::F32 {
     // -2 sqrt(2 / pi), and the same times 0.044715.
@@ -114,8 +120,8 @@ fn gelu_erf_vector<S: Simd>(simd: S, x: S::F32) -> S::F32 {
     simd.fma(simd.sub(zero, a), tail, simd.max(zero, x))
 }
 
-/// `2^r` for `|r| <= 1/2`, highest power first: least relative error among the polynomials of this degree that are 1 at
-/// 0; 8e-8 evaluated in float32.
+/// `2^r` for `|r| <= 1/2`, highest power first: least relative error among the polynomials of this degree
+/// that are 1 at 0; 8e-8 evaluated in float32.
 pub(crate) const EXP2: [f32; 7] = [
     1.535_336_2e-4,
     1.339_887_5e-3,
@@ -131,14 +137,15 @@ pub(crate) const EXP2_FOR_BF16: [f32; 4] = [5.500_893_3e-2, 0.242_210_97, 0.693_
 
 /// `exp(x)` for `x <= 0` by a polynomial for `2^r`; 0 below -87.7 (-126.5 ln 2), NaN where it is NaN.
 ///
-/// No step has a denormal result for a removed key, whose `x` is `-inf`. A vector with one takes some 200 cycles on Intel
-/// (AMX, 2 MB of L2 a core): two such vectors in each row of scores took a third to half of the time of attention.
+/// No step has a denormal result for a removed key, whose `x` is `-inf`. A vector with one takes some 200
+/// cycles on Intel (AMX, 2 MB of L2 a core): two such vectors in each row of scores took a third to half of
+/// the time of attention.
 #[inline(always)]
 pub(crate) fn exp_below_zero<S: Simd, const N: usize>(simd: S, x: S::F32, exp2: &[f32; N]) -> S::F32 {
     /// Sums with it are rounded to whole numbers, whose low bits are an exponent with its bias of 127.
     const WHOLE: f32 = 12_582_912.0 + 127.0;
-    // From -126.5 ln 2 down to this bound, the whole part is -127, whose power of two has the bits of zero. The second
-    // operand wins if it is NaN.
+    // From -126.5 ln 2 down to this bound, the whole part is -127, whose power of two has the bits of zero.
+    // The second operand wins if it is NaN.
     let x = simd.max(simd.splat(-88.0), x);
     let log2_e = simd.splat(std::f32::consts::LOG2_E);
     let whole = simd.fma(x, log2_e, simd.splat(WHOLE));
@@ -184,7 +191,8 @@ mod tests {
     use crate::isa::Isa;
     use crate::simd::{Kernel, MAX_LANES, Simd};
 
-    /// The exponentials of a number below zero with the two polynomials, and the one that is added to 1, in all lanes.
+    /// The exponentials of a number below zero with the two polynomials, and the one that is added to 1, in
+    /// all lanes.
     struct ExpBelowZero(f32);
 
     impl Kernel for ExpBelowZero {
@@ -226,7 +234,8 @@ mod tests {
 
     #[test]
     fn exponentials_below_zero_end_at_zero() {
-        // Relative, of the two polynomials at zero; `x log2(e)` is rounded once or twice, and its whole part is then lost.
+        // Relative, of the two polynomials at zero; `x log2(e)` is rounded once or twice, and its whole part
+        // is then lost.
         let errors = [3e-7, 1.1e-4];
         for isa in Isa::available() {
             for x in [

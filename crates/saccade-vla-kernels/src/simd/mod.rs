@@ -1,8 +1,8 @@
 //! Vectors of f32 and i32: the kernels are written once over them, for all instruction sets.
 //!
-//! A value of a [`Simd`] type is a token. It proves that this CPU has an instruction set, so the operations on its
-//! vectors are safe methods of the token. [`Simd::run`] is the only place that turns target features on; a [`Kernel`] is
-//! inlined into it whole, so that every operation becomes an instruction or a few.
+//! A value of a [`Simd`] type is a token. It proves that this CPU has an instruction set, so the operations
+//! on its vectors are safe methods of the token. [`Simd::run`] is the only place that turns target features
+//! on; a [`Kernel`] is inlined into it whole, so that every operation becomes an instruction or a few.
 
 #[cfg(target_arch = "aarch64")]
 pub(crate) mod aarch64;
@@ -31,14 +31,15 @@ pub(crate) const MAX_TILE_ROWS: usize = 8;
 pub(crate) trait Simd: Copy + Send + Sync + 'static {
     /// Elements of a vector, at most [`MAX_LANES`].
     const LANES: usize;
-    /// Rows of the largest register tile (MR), at most [`MAX_TILE_ROWS`]. A tile is `TILE_ROWS x TILE_VECTORS` sums; as
-    /// many vectors as it is wide and a broadcast element stay in registers with them. The tile is large enough to hide
-    /// the latency of the multiply-adds.
+    /// Rows of the largest register tile (MR), at most [`MAX_TILE_ROWS`]. A tile is
+    /// `TILE_ROWS x TILE_VECTORS` sums; as many vectors as it is wide and a broadcast element stay in
+    /// registers with them. The tile is large enough to hide the latency of the multiply-adds.
     const TILE_ROWS: usize;
-    /// Vectors of a row of that tile (NR): at most 3 where linear layers are made of these vectors, 4 where only
-    /// attention is.
+    /// Vectors of a row of that tile (NR): at most 3 where linear layers are made of these vectors, 4 where
+    /// only attention is.
     const TILE_VECTORS: usize;
-    /// Whether multiply-adds take a factor from a lane: then there are [`Self::fma_lane`] and [`Self::dot_bf16_lane`].
+    /// Whether multiply-adds take a factor from a lane: then there are [`Self::fma_lane`] and
+    /// [`Self::dot_bf16_lane`].
     const BY_LANE: bool = false;
     /// The largest unsigned byte that [`Self::dot_int8`] accepts.
     const MAX_BYTE: u8;
@@ -109,16 +110,20 @@ pub(crate) trait Simd: Copy + Send + Sync + 'static {
     /// Rounded to bfloat16, to nearest and ties to even; NaN stays.
     fn round_to_bf16(self, x: Self::F32) -> Self::F32;
 
-    /// `a.low * b.low + a.high * b.high + sum` of the two bfloat16 in each word: the element that comes first is the low
-    /// half. Rounded once or twice; an instruction may take denormals for zero.
+    /// The elements of `first` and then those of `second`, two in a word, rounded as [`Self::round_to_bf16`]
+    /// does; an instruction may take denormals for zero.
+    fn to_bf16_pairs(self, first: Self::F32, second: Self::F32) -> Self::I32;
+
+    /// `a.low * b.low + a.high * b.high + sum` of the two bfloat16 in each word: the element that comes first
+    /// is the low half. Rounded once or twice; an instruction may take denormals for zero.
     #[inline(always)]
     fn dot_bf16(self, sum: Self::F32, a: Self::I32, b: Self::I32) -> Self::F32 {
         let low = self.fma(self.low_halves(a), self.low_halves(b), sum);
         self.fma(self.high_halves(a), self.high_halves(b), low)
     }
 
-    /// Adds to each sum the four products of its unsigned bytes `x`, at most [`Self::MAX_BYTE`], and its signed bytes
-    /// `w`, none of them -128.
+    /// Adds to each sum the four products of its unsigned bytes `x`, at most [`Self::MAX_BYTE`], and its
+    /// signed bytes `w`, none of them -128.
     fn dot_int8(self, sum: Self::I32, x: Self::I32, w: Self::I32) -> Self::I32;
 
     /// `a * b[LANE] + addend`, rounded once, where there is [`Self::BY_LANE`].
@@ -194,17 +199,14 @@ pub(crate) trait Simd: Copy + Send + Sync + 'static {
     /// Writes the first `LANES` bfloat16 of `to`, rounded as [`Self::round_to_bf16`] does.
     fn store_bf16(self, x: Self::F32, to: &mut [u16]);
 
-    /// Writes the first `2 * LANES` bfloat16 of `to`, rounded as [`Self::round_to_bf16`] does; an instruction may take
-    /// denormals for zero.
+    /// Writes the first `2 * LANES` bfloat16 of `to`, rounded as [`Self::to_bf16_pairs`] does.
     #[inline(always)]
     fn store_bf16_pair(self, first: Self::F32, second: Self::F32, to: &mut [u16]) {
-        let (first_to, second_to) = to.split_at_mut(Self::LANES);
-        self.store_bf16(first, first_to);
-        self.store_bf16(second, second_to);
+        write(self.to_bf16_pairs(first, second), to);
     }
 
-    /// Writes the first `LANES` bytes of `to`: each lane rounded to the nearest whole number, ties to even, plus `zero`,
-    /// and `most` where that is more. Any byte for lanes with which this is not in `0..=256`.
+    /// Writes the first `LANES` bytes of `to`: each lane rounded to the nearest whole number, ties to even,
+    /// plus `zero`, and `most` where that is more. Any byte for lanes with which this is not in `0..=256`.
     fn store_bytes(self, x: Self::F32, zero: Self::I32, most: Self::I32, to: &mut [u8]);
 
     /// # Safety
@@ -269,7 +271,8 @@ macro_rules! forward {
     ($(fn $method:ident $(<const $n:ident: i32>)? ($($argument:ident: $type:ty),*) $(-> $result:ty)? = $function:ident;)*) => {$(
         #[inline(always)]
         fn $method $(<const $n: i32>)? (self, $($argument: $type),*) $(-> $result)? {
-            // SAFETY: a token exists only where `new` found the target features, which are all that the function needs.
+            // SAFETY: a token exists only where `new` found the target features, which are all that the
+            // function needs.
             unsafe { $function $(::<$n>)? ($($argument),*) }
         }
     )*};
@@ -288,8 +291,8 @@ macro_rules! functions {
     )*};
 }
 
-/// A token: its features, found by `$detected`, a condition beside them, and constants, types and operations of its own.
-/// All other operations are functions of the module that uses this, by the names of the methods.
+/// A token: its features, found by `$detected`, a condition beside them, and constants, types and operations
+/// of its own. All other operations are functions of the module that uses this, by the names of the methods.
 macro_rules! token {
     (
         $(#[$doc:meta])*

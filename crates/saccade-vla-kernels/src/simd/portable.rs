@@ -2,12 +2,14 @@
 
 use half::bf16;
 
+use super::bits::cast;
 use super::{Kernel, Simd};
 
 /// Plain loops; every CPU runs them.
 pub(crate) type Portable = Loops<8>;
 
-/// Plain loops over `N` lanes, a power of two. The compiler spreads them over whatever vectors the target has.
+/// Plain loops over `N` lanes, a power of two. The compiler spreads them over whatever vectors the target
+/// has.
 #[derive(Clone, Copy)]
 pub(crate) struct Loops<const N: usize>;
 
@@ -179,6 +181,12 @@ impl<const N: usize> Simd for Loops<N> {
     #[inline(always)]
     fn round_to_bf16(self, x: [f32; N]) -> [f32; N] {
         x.map(|x| bf16::from_f32(x).to_f32())
+    }
+
+    #[inline(always)]
+    fn to_bf16_pairs(self, first: [f32; N], second: [f32; N]) -> [i32; N] {
+        let bits = [first, second].map(|x| x.map(|x| bf16::from_f32(x).to_bits()));
+        cast(bits)
     }
 
     #[inline(always)]

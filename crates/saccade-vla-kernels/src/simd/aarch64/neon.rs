@@ -23,8 +23,8 @@ macro_rules! neon {
             $(#[$doc])*
             $name: is_aarch64_feature_detected["neon" $(, $feature)*], {
                 const LANES: usize = 4;
-                // The tile of attention alone: 20 sums, five factors by lane, four columns and what widens them. Four
-                // vectors divide the usual widths of heads.
+                // The tile of attention alone: 20 sums, five factors by lane, four columns and what widens
+                // them. Four vectors divide the usual widths of heads.
                 const TILE_ROWS: usize = 5;
                 const TILE_VECTORS: usize = 4;
                 const BY_LANE: bool = true;
@@ -45,22 +45,26 @@ macro_rules! neon {
 neon! {
     /// NEON, which every 64-bit ARM has.
     Neon: [], {
+        forward! { fn to_bf16_pairs(first: float32x4_t, second: float32x4_t) -> int32x4_t = to_bf16_pairs; }
         type Dots = crate::simd::NoDots;
     }
 }
 
 neon! {
-    /// NEON with dot products of int8. [`gemm`](crate::gemm) has the products, which take a row's elements by lane.
+    /// NEON with dot products of int8. [`gemm`](crate::gemm) has the products, which take a row's elements by
+    /// lane.
     NeonDotprod: ["dotprod"], {
+        forward! { fn to_bf16_pairs(first: float32x4_t, second: float32x4_t) -> int32x4_t = to_bf16_pairs; }
         type Dots = crate::simd::old::neon::Dotprod;
         const DOT_NAME: &'static str = "dotprod";
     }
 }
 
 neon! {
-    /// NEON with products of matrices of int8. [`gemm`](crate::gemm) has the products, which are of two rows by two
-    /// columns.
+    /// NEON with products of matrices of int8. [`gemm`](crate::gemm) has the products, which are of two rows
+    /// by two columns.
     NeonI8mm: ["i8mm"], {
+        forward! { fn to_bf16_pairs(first: float32x4_t, second: float32x4_t) -> int32x4_t = to_bf16_pairs; }
         type Dots = crate::simd::old::neon::I8mm;
         const DOT_NAME: &'static str = "i8mm";
     }
@@ -75,7 +79,7 @@ neon! {
         forward! {
             fn dot_bf16(sum: float32x4_t, a: int32x4_t, b: int32x4_t) -> float32x4_t = dot_bf16;
             fn dot_bf16_lane<const LANE: i32>(sum: float32x4_t, a: int32x4_t, b: int32x4_t) -> float32x4_t = dot_bf16_lane;
-            fn store_bf16_pair(first: float32x4_t, second: float32x4_t, to: &mut [u16]) = store_bf16_pair;
+            fn to_bf16_pairs(first: float32x4_t, second: float32x4_t) -> int32x4_t = bfcvtn_pairs;
         }
     }
 }
@@ -93,10 +97,10 @@ functions! {
         unsafe { bfdot_lane::<LANE>(sum, cast(a), cast(b)) }
     }
 
-    fn store_bf16_pair(first: float32x4_t, second: float32x4_t, to: &mut [u16]) {
+    fn bfcvtn_pairs(first: float32x4_t, second: float32x4_t) -> int32x4_t {
         // SAFETY: the feature is on.
         let (first, second) = unsafe { (bfcvtn(first), bfcvtn(second)) };
-        write(vcombine_u16(first, second), to);
+        cast(vcombine_u16(first, second))
     }
 }
 
@@ -201,13 +205,21 @@ functions! {
     }
 
     fn round_to_bf16(x: float32x4_t) -> float32x4_t {
-        // Half a unit of the last place is added, less one where that place is even; a NaN's payload could overflow,
-        // so it becomes the quiet one.
+        // Half a unit of the last place is added, less one where that place is even; a NaN's payload could
+        // overflow, so it becomes the quiet one.
         let bits = vreinterpretq_u32_f32(x);
         let even = vandq_u32(vshrq_n_u32::<16>(bits), vdupq_n_u32(1));
         let rounded = vaddq_u32(vaddq_u32(bits, vdupq_n_u32(0x7fff)), even);
         let rounded = vandq_u32(rounded, vdupq_n_u32(0xffff_0000));
         vbslq_f32(vceqq_f32(x, x), vreinterpretq_f32_u32(rounded), vdupq_n_f32(f32::NAN))
+    }
+
+    fn bf16_bits(x: float32x4_t) -> uint16x4_t {
+        vshrn_n_u32::<16>(vreinterpretq_u32_f32(round_to_bf16(x)))
+    }
+
+    fn to_bf16_pairs(first: float32x4_t, second: float32x4_t) -> int32x4_t {
+        cast(vcombine_u16(bf16_bits(first), bf16_bits(second)))
     }
 
     fn dot_int8(sum: int32x4_t, x: int32x4_t, w: int32x4_t) -> int32x4_t {
@@ -235,7 +247,7 @@ functions! {
     }
 
     fn store_bf16(x: float32x4_t, to: &mut [u16]) {
-        write(vshrn_n_u32::<16>(vreinterpretq_u32_f32(round_to_bf16(x))), to);
+        write(bf16_bits(x), to);
     }
 
     fn store_bytes(x: float32x4_t, zero: int32x4_t, most: int32x4_t, to: &mut [u8]) {

@@ -1,4 +1,5 @@
-//! AVX-512 F, VL, BW and DQ: vectors of 512 bits, and the dot products of bfloat16 and int8 that go with them.
+//! AVX-512 F, VL, BW and DQ: vectors of 512 bits, and the dot products of bfloat16 and int8 that go with
+//! them.
 
 use std::arch::x86_64::*;
 
@@ -34,7 +35,10 @@ avx512! {
         type Dots = crate::simd::NoDots;
         // As with AVX2.
         const MAX_BYTE: u8 = 129;
-        forward! { fn dot_int8(sum: __m512i, x: __m512i, w: __m512i) -> __m512i = maddubs; }
+        forward! {
+            fn dot_int8(sum: __m512i, x: __m512i, w: __m512i) -> __m512i = maddubs;
+            fn to_bf16_pairs(first: __m512, second: __m512) -> __m512i = to_bf16_pairs;
+        }
     }
 }
 
@@ -44,13 +48,16 @@ avx512! {
         type Dots = crate::simd::old::avx512::Vnni;
         const MAX_BYTE: u8 = 255;
         const DOT_NAME: &'static str = "vnni";
-        forward! { fn dot_int8(sum: __m512i, x: __m512i, w: __m512i) -> __m512i = _mm512_dpbusd_epi32; }
+        forward! {
+            fn dot_int8(sum: __m512i, x: __m512i, w: __m512i) -> __m512i = _mm512_dpbusd_epi32;
+            fn to_bf16_pairs(first: __m512, second: __m512) -> __m512i = to_bf16_pairs;
+        }
     }
 }
 
 avx512! {
-    /// AVX-512 with BF16, where its products are faster than those of float32: on Intel's Sapphire Rapids they have half
-    /// the rate.
+    /// AVX-512 with BF16, where its products are faster than those of float32: on Intel's Sapphire Rapids
+    /// they have half the rate.
     Avx512Bf16: ["avx512bf16"] if Cpu::current().has_fast_bf16_dot(), {
         type Dots = crate::simd::old::avx512::Bf16;
         const MAX_BYTE: u8 = 129;
@@ -59,21 +66,21 @@ avx512! {
         forward! {
             fn dot_int8(sum: __m512i, x: __m512i, w: __m512i) -> __m512i = maddubs;
             fn dot_bf16(sum: __m512, a: __m512i, b: __m512i) -> __m512 = dpbf16;
-            fn store_bf16_pair(first: __m512, second: __m512, to: &mut [u16]) = cvtne2;
+            fn to_bf16_pairs(first: __m512, second: __m512) -> __m512i = cvtne2;
         }
     }
 }
 
 avx512! {
-    /// AVX-512 with what works beside the tiles of AMX: VNNI, and BF16 for conversions alone, because products of
-    /// bfloat16 are those of tiles.
+    /// AVX-512 with what works beside the tiles of AMX: VNNI, and BF16 for conversions alone, because
+    /// products of bfloat16 are those of tiles.
     Avx512Amx: ["avx512bf16", "avx512vnni"], {
         type Dots = crate::simd::old::avx512::BesideTiles;
         const MAX_BYTE: u8 = 255;
         const DOT_NAME: &'static str = "bf16";
         forward! {
             fn dot_int8(sum: __m512i, x: __m512i, w: __m512i) -> __m512i = _mm512_dpbusd_epi32;
-            fn store_bf16_pair(first: __m512, second: __m512, to: &mut [u16]) = cvtne2;
+            fn to_bf16_pairs(first: __m512, second: __m512) -> __m512i = cvtne2;
         }
     }
 }
@@ -85,8 +92,8 @@ functions! {
         _mm512_dpbf16_ps(sum, cast(a), cast(b))
     }
 
-    fn cvtne2(first: __m512, second: __m512, to: &mut [u16]) {
-        write(_mm512_cvtne2ps_pbh(second, first), to);
+    fn cvtne2(first: __m512, second: __m512) -> __m512i {
+        cast(_mm512_cvtne2ps_pbh(second, first))
     }
 }
 
@@ -189,6 +196,11 @@ functions! {
         _mm512_mask_mov_ps(_mm512_castsi512_ps(rounded), nan, _mm512_set1_ps(f32::NAN))
     }
 
+    fn to_bf16_pairs(first: __m512, second: __m512) -> __m512i {
+        let high = |x| _mm512_cvtepi32_epi16(_mm512_srli_epi32::<16>(_mm512_castps_si512(round_to_bf16(x))));
+        _mm512_inserti64x4::<1>(_mm512_castsi256_si512(high(first)), high(second))
+    }
+
     fn maddubs(sum: __m512i, x: __m512i, w: __m512i) -> __m512i {
         let pairs = _mm512_maddubs_epi16(x, w);
         _mm512_add_epi32(sum, _mm512_madd_epi16(pairs, _mm512_set1_epi16(1)))
@@ -219,8 +231,8 @@ functions! {
         for (row, from) in rows.iter_mut().zip(square) {
             *row = read(from);
         }
-        // Each quarter of four rows is a square of four by four, which is transposed: `quarters[4 * i + c]` holds, of
-        // rows 4 i to 4 i + 3, columns c, 4 + c, 8 + c and 12 + c.
+        // Each quarter of four rows is a square of four by four, which is transposed: `quarters[4 * i + c]`
+        // holds, of rows 4 i to 4 i + 3, columns c, 4 + c, 8 + c and 12 + c.
         let mut quarters = rows;
         for i in (0..16).step_by(4) {
             let [a, b, c, d] = [rows[i], rows[i + 1], rows[i + 2], rows[i + 3]];
