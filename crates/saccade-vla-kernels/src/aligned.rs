@@ -1,21 +1,22 @@
 //! Memory that begins on a cache line, so that no vector spans two of them; and the error of memory that the system refuses.
 
-use std::alloc::{Layout, alloc, alloc_zeroed, dealloc};
 use std::ops::{Deref, DerefMut};
-use std::ptr::NonNull;
+
+pub(crate) use bytemuck::Zeroable;
+use bytemuck::allocation::try_zeroed_vec;
 
 /// A cache line, and the widest vector.
 const ALIGNMENT: usize = 64;
 
-/// A huge page of x86-64, and of ARM with pages of 4 kB. Where pages have 64 kB, a huge one has 512 MB: memory is then aligned so in vain, but
-/// nobody waits for lookups either, of which 64 kB need few.
+/// A huge page of x86-64, and of ARM with pages of 4 kB. Pages of 64 kB have huge ones of 512 MB, which memory is not
+/// aligned to; with them few addresses are looked up anyway.
 const HUGE_PAGE: usize = 2 << 20;
 
 /// The system has refused memory.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 #[error("out of memory: {bytes} bytes were asked for")]
 pub struct AllocError {
-    /// What was asked for; `usize::MAX` where it does not fit into the address space.
+    /// The size that was asked for; `usize::MAX` where it does not fit into the address space.
     pub bytes: usize,
 }
 
@@ -24,87 +25,47 @@ pub(crate) fn elements(count: usize, size: usize) -> Result<usize, AllocError> {
     count.checked_mul(size).ok_or(AllocError { bytes: usize::MAX })
 }
 
-/// Types for which all bytes zero is a value.
-///
-/// # Safety
-/// That is so.
-pub(crate) unsafe trait Zeroable: Copy + Send + Sync {}
-// SAFETY: zero bytes are the number zero.
-unsafe impl Zeroable for f32 {}
-// SAFETY: as above.
-unsafe impl Zeroable for u32 {}
-// SAFETY: as above.
-unsafe impl Zeroable for i32 {}
-
-/// A fixed number of elements on a 64-byte boundary.
-pub(crate) struct AlignedBuffer<T: Zeroable> {
-    pointer: NonNull<T>,
+/// A fixed number of elements on a 64-byte boundary, and on a boundary of huge pages if they fill one.
+pub(crate) struct AlignedBuffer<T> {
+    /// More than are used: the allocator aligns them to their own size only, and leaves pages of zeros to be given at
+    /// first touch. If it aligned them to more it would write the zeros, on the thread that allocates.
+    memory: Vec<T>,
+    first: usize,
     len: usize,
 }
 
-// SAFETY: the buffer owns its memory alone, and its elements are plain numbers.
-unsafe impl<T: Zeroable> Send for AlignedBuffer<T> {}
-// SAFETY: as above; shared references only read.
-unsafe impl<T: Zeroable> Sync for AlignedBuffer<T> {}
-
-impl<T: Zeroable> AlignedBuffer<T> {
-    /// No elements, and no memory.
-    pub(crate) fn empty() -> Self {
+impl<T: Zeroable + Copy> AlignedBuffer<T> {
+    /// An empty buffer; allocates nothing.
+    pub(crate) const fn empty() -> Self {
         Self {
-            pointer: NonNull::dangling(),
+            memory: Vec::new(),
+            first: 0,
             len: 0,
         }
     }
 
     /// `len` zeros.
     pub(crate) fn zeroed(len: usize) -> Result<Self, AllocError> {
-        let layout = Self::layout(len)?;
-        if layout.size() != 0 && layout.align() == ALIGNMENT {
-            // SAFETY: the layout is not of size zero.
-            let memory = unsafe { alloc_zeroed(layout) };
-            return Self::owned(memory, len, layout);
+        let bytes = elements(len, size_of::<T>())?;
+        if bytes == 0 {
+            return Ok(Self { len, ..Self::empty() });
         }
-        // SAFETY: the memory is written at once.
-        unsafe {
-            let buffer = Self::unwritten(len)?;
-            buffer.pointer.as_ptr().write_bytes(0, len);
-            Ok(buffer)
-        }
-    }
-
-    /// Memory that nothing has been written to: the threads that write it first also wait for its pages.
-    ///
-    /// # Safety
-    /// Every element is written, through [`AlignedBuffer::pointer`], before the buffer is used as a slice.
-    pub(crate) unsafe fn unwritten(len: usize) -> Result<Self, AllocError> {
-        let layout = Self::layout(len)?;
-        if layout.size() == 0 {
-            return Ok(Self {
-                pointer: NonNull::dangling(),
-                len,
-            });
-        }
-        // SAFETY: the layout is not of size zero.
-        let memory = unsafe { alloc(layout) };
-        let buffer = Self::owned(memory, len, layout)?;
-        if layout.align() == HUGE_PAGE {
-            // Before it is touched: pages are given at first touch.
-            // SAFETY: the memory was just allocated.
-            unsafe { advise_huge_pages(memory, layout.size()) };
+        let alignment = if bytes < HUGE_PAGE { ALIGNMENT } else { HUGE_PAGE };
+        let slack = alignment / align_of::<T>();
+        let refused = |()| AllocError { bytes };
+        let memory = try_zeroed_vec::<T>(len.saturating_add(slack)).map_err(refused)?;
+        // Some interpreters know no addresses; then nothing is aligned.
+        let first = memory.as_ptr().align_offset(alignment).min(slack);
+        let mut buffer = Self { memory, first, len };
+        if alignment == HUGE_PAGE {
+            advise_huge_pages(&mut buffer);
         }
         Ok(buffer)
     }
 
-    fn owned(memory: *mut u8, len: usize, layout: Layout) -> Result<Self, AllocError> {
-        match NonNull::new(memory.cast()) {
-            Some(pointer) => Ok(Self { pointer, len }),
-            None => Err(AllocError { bytes: layout.size() }),
-        }
-    }
-
-    /// Where the first element is.
+    /// A pointer to the first element.
     pub(crate) fn pointer(&mut self) -> *mut T {
-        self.pointer.as_ptr()
+        self.as_mut_ptr()
     }
 
     /// A copy.
@@ -113,70 +74,48 @@ impl<T: Zeroable> AlignedBuffer<T> {
         copy.copy_from_slice(self);
         Ok(copy)
     }
-
-    fn layout(len: usize) -> Result<Layout, AllocError> {
-        let of = |alignment| {
-            let layout = Layout::array::<T>(len).and_then(|layout| layout.align_to(alignment));
-            layout.map_err(|_| AllocError { bytes: usize::MAX })
-        };
-        let layout = of(ALIGNMENT)?;
-        if layout.size() < HUGE_PAGE {
-            Ok(layout)
-        } else {
-            of(HUGE_PAGE)
-        }
-    }
 }
 
 /// Asks for huge pages: weights are streamed, and with small pages the CPU looks up an address every 4 kB of them.
-///
-/// # Safety
-/// `memory` is `size` bytes that nobody else uses.
-unsafe fn advise_huge_pages(memory: *mut u8, size: usize) {
-    #[cfg(target_os = "linux")]
-    // SAFETY: advice changes neither contents nor validity of the memory. It may be refused: then pages stay small.
+/// Pages are given at first touch, so this comes before it.
+fn advise_huge_pages<T>(memory: &mut [T]) {
+    #[cfg(all(target_os = "linux", not(saccade_portable)))]
+    // SAFETY: the memory is borrowed for the call. Advice changes neither its contents nor whether it may be used, and
+    // may be refused: then pages stay small.
     unsafe {
-        libc::madvise(memory.cast(), size, libc::MADV_HUGEPAGE);
+        libc::madvise(
+            memory.as_mut_ptr().cast(),
+            size_of_val(memory),
+            libc::MADV_HUGEPAGE,
+        );
     }
-    #[cfg(not(target_os = "linux"))]
-    let _ = (memory, size);
+    #[cfg(not(all(target_os = "linux", not(saccade_portable))))]
+    let _ = memory;
 }
 
-impl<T: Zeroable> Drop for AlignedBuffer<T> {
-    fn drop(&mut self) {
-        // A buffer whose layout cannot be was never made.
-        if let Ok(layout) = Self::layout(self.len)
-            && layout.size() != 0
-        {
-            // SAFETY: the memory was allocated with this layout.
-            unsafe { dealloc(self.pointer.as_ptr().cast(), layout) };
-        }
-    }
-}
-
-impl<T: Zeroable> Deref for AlignedBuffer<T> {
+impl<T> Deref for AlignedBuffer<T> {
     type Target = [T];
 
+    #[inline]
     fn deref(&self) -> &[T] {
-        // SAFETY: `len` elements were allocated, and zero bytes are values of them.
-        unsafe { std::slice::from_raw_parts(self.pointer.as_ptr(), self.len) }
+        &self.memory[self.first..][..self.len]
     }
 }
 
-impl<T: Zeroable> DerefMut for AlignedBuffer<T> {
+impl<T> DerefMut for AlignedBuffer<T> {
+    #[inline]
     fn deref_mut(&mut self) -> &mut [T] {
-        // SAFETY: as above, and the reference is the only one.
-        unsafe { std::slice::from_raw_parts_mut(self.pointer.as_ptr(), self.len) }
+        &mut self.memory[self.first..][..self.len]
     }
 }
 
-/// Numbers that begin on a cache line, and of which there may be more or fewer from call to call: activations between layers.
+/// A vector of numbers that begins on a cache line: activations between layers.
 ///
-/// Vectors of AVX-512 are whole cache lines. In a `Vec`, which begins anywhere, each of them lies across two: int8 `sample` of N1.5 took
-/// 1.02 to 1.08 times as long, bfloat16 1.01 to 1.04 times (Intel with AMX, 2 threads).
+/// Vectors of AVX-512 are whole cache lines. In a `Vec`, which begins anywhere, each of them lies across two: int8
+/// `sample` of N1.5 took 1.02 to 1.08 times as long, bfloat16 1.01 to 1.04 times (a Xeon with AMX, 2 threads).
 ///
 /// ```
-/// let mut hidden = saccade_vla_kernels::Activations::new();
+/// let mut hidden = saccade_vla_kernels::AlignedVec::new();
 /// hidden.reserve(5)?;
 /// hidden.resize(3);
 /// hidden.fill(1.0);
@@ -186,73 +125,68 @@ impl<T: Zeroable> DerefMut for AlignedBuffer<T> {
 /// assert!(hidden.is_empty());
 /// # Ok::<(), saccade_vla_kernels::AllocError>(())
 /// ```
-pub struct Activations {
-    /// Only the first `len` elements are sure to have been written.
+pub struct AlignedVec {
+    /// As many as there is capacity for; `len` of them are elements.
     memory: AlignedBuffer<f32>,
     len: usize,
 }
 
-impl Activations {
-    /// None, and no memory.
+impl AlignedVec {
+    /// An empty vector; allocates nothing.
     #[must_use]
-    pub fn new() -> Self {
+    pub const fn new() -> Self {
         Self {
             memory: AlignedBuffer::empty(),
             len: 0,
         }
     }
 
-    /// Makes room for `len` of them in all. Where that takes other memory, the memory so far is given back first, and none are left: peak
-    /// memory is that of the larger number, not of both.
+    /// Ensures capacity for `len` elements in all. If that takes another allocation, the old one is freed first and its
+    /// elements are lost, so that peak memory is the larger of the two.
     ///
     /// # Errors
-    /// [`AllocError`] if there is not enough memory; none are left then either.
+    /// [`AllocError`] if there is not enough memory; no elements are left then either.
     pub fn reserve(&mut self, len: usize) -> Result<(), AllocError> {
         if len > self.memory.len {
             *self = Self::new();
-            // SAFETY: elements are written before they are counted in `len`, and no others are read.
-            self.memory = unsafe { AlignedBuffer::unwritten(len)? };
+            self.memory = AlignedBuffer::zeroed(len)?;
         }
         Ok(())
     }
 
-    /// Sets their number. The first ones keep their values, new ones are zero.
+    /// Sets the number of elements. The first ones keep their values, new ones are zero.
     ///
     /// # Panics
-    /// If there is no room for them.
+    /// If `len` is more than there is capacity for.
     pub fn resize(&mut self, len: usize) {
-        assert!(
-            len <= self.memory.len,
-            "{len} activations, room for {}",
-            self.memory.len
-        );
+        let capacity = self.memory.len;
+        assert!(len <= capacity, "{len} elements, capacity for {capacity}");
         if len > self.len {
-            // SAFETY: there is room.
-            unsafe { self.memory.pointer().add(self.len).write_bytes(0, len - self.len) };
+            self.memory[self.len..len].fill(0.0);
         }
         self.len = len;
     }
 }
 
-impl Default for Activations {
+impl Default for AlignedVec {
     fn default() -> Self {
         Self::new()
     }
 }
 
-impl Deref for Activations {
+impl Deref for AlignedVec {
     type Target = [f32];
 
+    #[inline]
     fn deref(&self) -> &[f32] {
-        // SAFETY: so many elements were written.
-        unsafe { std::slice::from_raw_parts(self.memory.pointer.as_ptr(), self.len) }
+        &self.memory[..self.len]
     }
 }
 
-impl DerefMut for Activations {
+impl DerefMut for AlignedVec {
+    #[inline]
     fn deref_mut(&mut self) -> &mut [f32] {
-        // SAFETY: as above, and the reference is the only one.
-        unsafe { std::slice::from_raw_parts_mut(self.memory.pointer.as_ptr(), self.len) }
+        &mut self.memory[..self.len]
     }
 }
 
@@ -283,43 +217,43 @@ mod tests {
     }
 
     #[test]
-    fn activations_are_kept_within_their_memory() {
-        let mut activations = Activations::new();
-        assert!(activations.is_empty());
-        activations.reserve(3).unwrap();
-        activations.resize(3);
-        activations.copy_from_slice(&[1.0, 2.0, 3.0]);
+    fn elements_are_kept_within_their_memory() {
+        let mut vector = AlignedVec::new();
+        assert!(vector.is_empty());
+        vector.reserve(3).unwrap();
+        vector.resize(3);
+        vector.copy_from_slice(&[1.0, 2.0, 3.0]);
         for (len, expected) in [(2, &[1.0, 2.0][..]), (3, &[1.0, 2.0, 0.0]), (0, &[])] {
-            activations.reserve(len).unwrap();
-            activations.resize(len);
-            assert_eq!(activations[..], *expected);
+            vector.reserve(len).unwrap();
+            vector.resize(len);
+            assert_eq!(vector[..], *expected);
         }
     }
 
     #[test]
-    fn activations_that_need_other_memory_begin_anew() {
-        let mut activations = Activations::new();
+    fn another_allocation_begins_empty() {
+        let mut vector = AlignedVec::new();
         for len in [3, HUGE_PAGE] {
-            activations.reserve(len).unwrap();
-            assert!(activations.is_empty());
-            activations.resize(len);
-            assert!(activations.iter().all(|&element| element == 0.0));
-            activations.fill(1.0);
+            vector.reserve(len).unwrap();
+            assert!(vector.is_empty());
+            vector.resize(len);
+            assert!(vector.iter().all(|&element| element == 0.0));
+            vector.fill(1.0);
         }
-        let error = activations.reserve(usize::MAX / 2).unwrap_err();
+        let error = vector.reserve(usize::MAX / 2).unwrap_err();
         assert_eq!(error, AllocError { bytes: usize::MAX });
-        assert!(activations.is_empty());
-        activations.reserve(HUGE_PAGE).unwrap();
-        activations.resize(HUGE_PAGE);
-        assert!(activations.iter().all(|&element| element == 0.0));
-        assert_eq!(activations.as_ptr().addr() % ALIGNMENT, 0);
+        assert!(vector.is_empty());
+        vector.reserve(HUGE_PAGE).unwrap();
+        vector.resize(HUGE_PAGE);
+        assert!(vector.iter().all(|&element| element == 0.0));
+        assert_eq!(vector.as_ptr().addr() % ALIGNMENT, 0);
     }
 
     #[test]
-    #[should_panic(expected = "3 activations, room for 2")]
-    fn activations_need_room() {
-        let mut activations = Activations::new();
-        activations.reserve(2).unwrap();
-        activations.resize(3);
+    #[should_panic(expected = "3 elements, capacity for 2")]
+    fn elements_need_capacity() {
+        let mut vector = AlignedVec::new();
+        vector.reserve(2).unwrap();
+        vector.resize(3);
     }
 }

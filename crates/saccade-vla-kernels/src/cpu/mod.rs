@@ -1,14 +1,13 @@
 //! Which CPU this is, what was measured on its family, and whether the system lets this process use tiles.
 
 pub(crate) mod family;
-mod once;
 mod signature;
 pub(crate) mod tiles;
 
 use std::fmt;
 
 use family::{Family, Rates};
-use once::Once;
+use once_cell::race::OnceBox;
 use signature::Signature;
 
 /// What is known of a CPU.
@@ -32,10 +31,11 @@ impl Cpu {
         }
     }
 
-    /// That of this process, looked at once.
+    /// The CPU that this process runs on, detected once. No thread waits for another one that detects it: after a fork
+    /// that one might not be there.
     pub(crate) fn current() -> &'static Self {
-        static CURRENT: Once<Cpu> = Once::new();
-        CURRENT.get_or_make(|| Self::new(Signature::current()))
+        static CURRENT: OnceBox<Cpu> = OnceBox::new();
+        CURRENT.get_or_init(|| Box::new(Self::new(Signature::current())))
     }
 
     fn rates(&self) -> Option<&Rates> {

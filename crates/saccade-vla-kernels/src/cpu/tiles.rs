@@ -1,6 +1,6 @@
 //! Whether this process may use tiles (AMX): asked once, and if the answer is no, why.
 
-use super::once::Once;
+use once_cell::race::OnceBox;
 
 /// Why tiles cannot be used.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
@@ -98,14 +98,13 @@ const ENOSPC: i32 = 28;
 /// Whether this process may use tiles. Asked once: the answer holds for all threads, also for those that run already, and for forked
 /// children. XCR0 shows the state without permission too, and the first instruction on a tile would then be SIGILL.
 pub(crate) fn permission() -> Result<(), Refusal> {
-    static ANSWER: Once<Result<(), Refusal>> = Once::new();
-    *ANSWER.get_or_make(|| {
+    static ANSWER: OnceBox<Result<(), Refusal>> = OnceBox::new();
+    *ANSWER.get_or_init(|| {
         #[cfg(target_arch = "x86_64")]
-        {
-            ask(&ThisMachine)
-        }
+        let answer = ask(&ThisMachine);
         #[cfg(not(target_arch = "x86_64"))]
-        Err(Refusal::NotThere)
+        let answer = Err(Refusal::NotThere);
+        Box::new(answer)
     })
 }
 

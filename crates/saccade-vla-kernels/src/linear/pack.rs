@@ -29,8 +29,7 @@ pub(super) fn pack_panels(
     let num_panels = out_features.div_ceil(columns);
     let size = gemm.panel_words(in_features);
     let int8 = if is_int8 { columns } else { 0 };
-    // SAFETY: the tasks below write all of it; where they were stopped, it is dropped.
-    let mut words = unsafe { AlignedBuffer::unwritten(elements(num_panels, size)?)? };
+    let mut words = AlignedBuffer::zeroed(elements(num_panels, size)?)?;
     let mut scales = AlignedBuffer::zeroed(num_panels * int8)?;
     let mut sums = AlignedBuffer::zeroed(num_panels * int8)?;
     let to = To {
@@ -41,14 +40,13 @@ pub(super) fn pack_panels(
     parallel_for(threads, num_panels, &|index| {
         let to = &to;
         let (first, end) = (index * columns, (index + 1) * columns);
-        // SAFETY: the buffers hold `num_panels` panels, and each task has its own, which is zero from here on.
-        unsafe { to.words.add(index * size).write_bytes(0, size) };
         let mut part_first = 0;
         for (weight, _) in parts {
             let part_end = part_first + weight.shape().0;
             let (from, until) = (part_first.max(first), part_end.min(end));
             if from < until {
-                // SAFETY: as above; the panel of the part before is not used any more.
+                // SAFETY: the buffers hold `num_panels` panels, and each task has its own; that of the part before is
+                // not used any more.
                 let panel = unsafe {
                     PanelMut {
                         words: std::slice::from_raw_parts_mut(to.words.add(index * size), size),
