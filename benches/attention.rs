@@ -2,7 +2,7 @@
 
 use faer::linalg::matmul::matmul;
 use faer::{Accum, MatMut, MatRef, Par};
-use saccade_benches::measure::{Contender, measure};
+use saccade_benches::measure::{Contender, MULTIPLY_ACCUMULATES, measure};
 use saccade_benches::options::Options;
 use saccade_benches::random::Random;
 use saccade_benches::report::Report;
@@ -42,7 +42,7 @@ impl Shape {
 
 fn main() {
     let options = Options::from_args();
-    let mut report = Report::begin("attention", &options);
+    let mut report = Report::begin("attention", MULTIPLY_ACCUMULATES, &options);
     for (queries, keys, num_heads, head_dim) in SHAPES {
         let name = format!("{queries} queries, {keys} keys, {num_heads} heads x {head_dim}");
         if !options.wants(&name) {

@@ -7,14 +7,19 @@ use std::hint::black_box;
 use std::io::{BufWriter, Write};
 use std::path::{Path, PathBuf};
 
-use criterion::{Criterion, criterion_group, criterion_main};
 use half::bf16;
+use saccade_benches::measure::{Contender, measure};
+use saccade_benches::options::Options;
 use saccade_benches::random::Random;
+use saccade_benches::report::Report;
 use saccade_vla::{ActionHead, Array, ArrayMut, Features, LoadOptions, Sampling};
 use serde_json::{Map, Value, json};
 
 const NUM_VL_TOKENS: usize = 296;
 const CHUNK: usize = 16 * 32; // action_horizon x action_dim
+
+/// The work of one call, so that rates are calls a second.
+const CALL: f64 = 1e9;
 
 /// GR00T N1.5's sizes, with one embodiment.
 fn config() -> Value {
@@ -83,37 +88,40 @@ fn load() -> ActionHead {
     head.expect("the checkpoint that was just written")
 }
 
-fn head(criterion: &mut Criterion) {
+fn main() {
+    let options = Options::from_args();
     let head = load();
+    let mut report = Report::begin("head", "calls", &options);
     let mut random = Random::new(1);
     let mut numbers = |len: usize| random.vec(len, 1.0);
     let (features, state, noise) = (numbers(NUM_VL_TOKENS * 2048), numbers(64), numbers(8 * CHUNK));
     let features = Array::new(&features, &[1, NUM_VL_TOKENS, 2048]).expect("a shape that fits");
     let features = Features::new(features);
     let context = head.encode(&features).expect("features that fit");
-    let mut group =
-        criterion.benchmark_group(format!("N1.5, {}, {} threads", head.isa(), head.num_threads()));
-    group.sample_size(10);
-    group.bench_function("encode", |bencher| {
-        bencher.iter(|| black_box(head.encode(&features)))
-    });
+    let mut contenders = vec![Contender::new("encode", CALL, || {
+        black_box(head.encode(&features).expect("features that fit"));
+    })];
     for samples in [1, 8] {
+        let (head, context, state, noise) = (&head, &context, &state, &noise);
         let mut out = vec![0.0; samples * CHUNK];
-        group.bench_function(format!("sample {samples}"), |bencher| {
-            bencher.iter(|| {
-                head.sample(
-                    &context,
-                    Array::new(&state, &[1, 64])?,
-                    Array::new(&[0], &[])?,
-                    Array::new(&noise[..samples * CHUNK], &[1, samples, 16, 32])?,
-                    &Sampling::default().with_num_samples(samples),
-                    ArrayMut::new(&mut out, &[1, samples, 16, 32])?,
-                )
-            });
-        });
+        let mut sample = move || {
+            head.sample(
+                context,
+                Array::new(state, &[1, 64])?,
+                Array::new(&[0], &[])?,
+                Array::new(&noise[..samples * CHUNK], &[1, samples, 16, 32])?,
+                &Sampling::default().with_num_samples(samples),
+                ArrayMut::new(&mut out, &[1, samples, 16, 32])?,
+            )
+        };
+        contenders.push(Contender::new(format!("sample {samples}"), CALL, move || {
+            sample().expect("inputs that fit");
+        }));
     }
-    group.finish();
+    for contender in &mut contenders {
+        contender.threads = head.num_threads();
+    }
+    let name = format!("N1.5, {}", head.isa());
+    report.case(&name, &measure(&options, &mut contenders));
+    report.end(&options);
 }
-
-criterion_group!(benches, head);
-criterion_main!(benches);

@@ -9,7 +9,7 @@ use gemmkit::{Parallelism, gemm_i8_packed_b, gemm_packed_b, prepack_rhs, prepack
 use half::bf16;
 use rten_gemm::{GemmExecutor, GemmInT, GemmInputA, GemmInputB, GemmOptions, GemmOutT};
 use rten_tensor::NdTensorView;
-use saccade_benches::measure::{Contender, arithmetic_name, measure};
+use saccade_benches::measure::{Contender, MULTIPLY_ACCUMULATES, arithmetic_name, measure};
 use saccade_benches::options::Options;
 use saccade_benches::random::Random;
 use saccade_benches::report::Report;
@@ -65,7 +65,7 @@ const ARITHMETICS: [Arithmetic; 3] = [Arithmetic::Float32, Arithmetic::Bfloat16,
 
 fn main() {
     let options = Options::from_args();
-    let mut report = Report::begin("linear", &options);
+    let mut report = Report::begin("linear", MULTIPLY_ACCUMULATES, &options);
     let bandwidths: Vec<_> = options
         .threads
         .iter()

@@ -1,6 +1,6 @@
 //! The ceilings that the other benches are compared with: multiply-accumulates a second, checked against clock x units, and read bandwidth.
 
-use saccade_benches::measure::{Contender, measure, quantile};
+use saccade_benches::measure::{Contender, MULTIPLY_ACCUMULATES, measure, quantile};
 use saccade_benches::options::Options;
 use saccade_benches::report::Report;
 use saccade_vla_kernels::peak::{READ_STREAMS, clock_hz, read_bytes_per_second};
@@ -8,7 +8,7 @@ use saccade_vla_kernels::{Arithmetic, Isa};
 
 fn main() {
     let options = Options::from_args();
-    let mut report = Report::begin("peak", &options);
+    let mut report = Report::begin("peak", MULTIPLY_ACCUMULATES, &options);
     let mut contenders = Vec::new();
     for &threads in &options.threads {
         for isa in Isa::available() {

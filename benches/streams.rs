@@ -3,7 +3,7 @@
 //!
 //! `cargo bench -p saccade-benches --bench streams -- --threads 1,2 --rounds 60`
 
-use saccade_benches::measure::{Contender, arithmetic_name, measure};
+use saccade_benches::measure::{Contender, MULTIPLY_ACCUMULATES, arithmetic_name, measure};
 use saccade_benches::options::Options;
 use saccade_benches::random::Random;
 use saccade_benches::report::Report;
@@ -37,7 +37,7 @@ fn has_streams(isa: Isa) -> bool {
 
 fn main() {
     let options = Options::from_args();
-    let mut report = Report::begin("streams", &options);
+    let mut report = Report::begin("streams", MULTIPLY_ACCUMULATES, &options);
     println!("{}", saccade_vla_kernels::CpuReport::current().family);
     let (measured, left_out): (Vec<_>, Vec<_>) =
         Isa::available().into_iter().partition(|&isa| has_streams(isa));

@@ -22,8 +22,10 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parent.parent.parent
 #: The oldest supported glibc as a platform tag; Rust supports none older.
 COMPATIBILITY = "manylinux_2_17"
+#: Without the default features of the binding, which only tests need.
 BUILD = (
-    f"-m maturin build --release --locked --quiet --zig --compatibility {COMPATIBILITY} --auditwheel check"
+    f"-m maturin build --release --locked --quiet --zig --compatibility {COMPATIBILITY} --auditwheel check "
+    "--no-default-features"
 )
 #: Pure Python, the same for every target. The plugin needs lerobot to run, but not to be packed.
 PURE = ("./lab", "./plugins/lerobot")

@@ -9,18 +9,34 @@ use saccade_vla_kernels::{Arithmetic, Isa};
 
 use crate::options::{Clock, Options};
 
+/// The unit of rates whose work is multiply-accumulates.
+pub const MULTIPLY_ACCUMULATES: &str = "1e9 multiply-accumulates";
+
 /// Something to time.
 pub struct Contender<'a> {
     /// Its name in the table.
     pub name: String,
     /// How many threads it uses.
     pub threads: usize,
-    /// Multiply-accumulates of one call.
+    /// Multiply-accumulates, or other units of work, of one call.
     pub work: f64,
     /// Name of the contender that its rate is divided by.
     pub relative_to: Option<String>,
     /// One call.
     pub run: Box<dyn FnMut() + 'a>,
+}
+
+impl<'a> Contender<'a> {
+    /// One without a base, on one thread.
+    pub fn new(name: impl Into<String>, work: f64, run: impl FnMut() + 'a) -> Self {
+        Self {
+            name: name.into(),
+            threads: 1,
+            work,
+            relative_to: None,
+            run: Box::new(run),
+        }
+    }
 }
 
 impl Contender<'_> {
@@ -59,7 +75,7 @@ pub fn arithmetic_name(arithmetic: Arithmetic) -> &'static str {
     }
 }
 
-/// Rates of one contender, in `1e9` multiply-accumulates a second, one a round.
+/// Rates of one contender, in `1e9` units of work a second, one a round.
 #[derive(Clone, Debug)]
 pub struct Rates {
     /// The contender's name.

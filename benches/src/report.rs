@@ -12,16 +12,16 @@ pub struct Report {
 }
 
 impl Report {
-    /// Prints what machine this is and what the columns mean.
+    /// Prints what machine this is and what the columns mean; a rate is in `unit` a second.
     #[must_use]
-    pub fn begin(title: &str, options: &Options) -> Self {
+    pub fn begin(title: &str, unit: &str, options: &Options) -> Self {
         println!(
             "{title}\n{}; {} rounds, {:?} clock",
             cpu(),
             options.rounds,
             options.clock
         );
-        println!("rates in 1e9 multiply-accumulates a second: median [10 % .. 90 % of the samples]");
+        println!("rates in {unit} a second: median [10 % .. 90 % of the samples]");
         Self { cases: Vec::new() }
     }
 

@@ -37,6 +37,7 @@ class Machine:
         read_by_streams: Bandwidth by the number of streams that each thread reads.
         family: Name of the CPU's family, such as ``Zen 5``; ``unknown family``, or the architecture where
             there is no CPUID.
+        kernels: Names of the kernels of linear layers, by arithmetic, such as ``avx512-vnni-int8``.
     """
 
     isa: str
@@ -46,6 +47,7 @@ class Machine:
     clock_hz: float | None = None
     read_by_streams: Mapping[int, float] = field(default_factory=dict)
     family: str = ""
+    kernels: Mapping[str, str] = field(default_factory=dict)
 
     @classmethod
     def measured(cls, isa: str, num_threads: int) -> Machine:
@@ -59,6 +61,7 @@ class Machine:
             peaks["clock_hz"],
             peaks["read_bytes_per_second_by_streams"],
             _saccade.cpu_report()[0].partition(" (")[0],
+            peaks["kernels"][isa],
         )
 
     def floor(self, arithmetic: str, multiply_adds: float, num_bytes: float) -> float:
@@ -136,12 +139,16 @@ class Call:
 
 @dataclass(frozen=True)
 class Counter:
-    """What one part did in a run: its calls, their time, multiply-adds and bytes of weights read."""
+    """What one part did in a run: its calls, their time, multiply-adds and bytes of weights read.
+
+    ``kernel`` is the kernel of its linear layers; empty for other parts.
+    """
 
     calls: int
     seconds: float
     multiply_adds: int
     num_bytes: int
+    kernel: str = ""
 
     def floor(self, machine: Machine, arithmetic: str) -> float:
         """The least time of the part on a machine, in seconds."""
@@ -215,7 +222,10 @@ def profiled(work: Callable[[], Any]) -> tuple[float, dict[str, Counter]]:
         start = time.perf_counter()
         work()
         seconds = time.perf_counter() - start
-    counters = {part: Counter(*counted) for part, counted in profile.counters().items()}
+    kernels = profile.kernels()
+    counters = {
+        part: Counter(*counted, kernels.get(part, "")) for part, counted in profile.counters().items()
+    }
     return seconds, {part: counter for part, counter in counters.items() if counter.calls}
 
 

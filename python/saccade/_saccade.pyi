@@ -300,6 +300,7 @@ class profile:
     def __enter__(self) -> profile: ...
     def __exit__(self, *_error: object) -> None: ...
     def counters(self) -> dict[str, tuple[int, float, int, int]]: ...  # calls, seconds, multiply-adds, bytes
+    def kernels(self) -> dict[str, str]: ...  # of linear layers, by part
 
 @final
 class stay_on_this_thread:

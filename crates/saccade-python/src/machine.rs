@@ -26,9 +26,9 @@ pub(crate) fn measure_peaks(py: Python<'_>, num_threads: usize) -> PyResult<Boun
     if !isas.contains(&selected) {
         isas.push(selected);
     }
-    let rates = PyDict::new(py);
+    let (rates, kernels) = (PyDict::new(py), PyDict::new(py));
     for isa in isas {
-        let of_isa = PyDict::new(py);
+        let (of_isa, kernels_of_isa) = (PyDict::new(py), PyDict::new(py));
         for (name, arithmetic) in [
             ("float32", Arithmetic::Float32),
             ("bfloat16", Arithmetic::Bfloat16),
@@ -38,11 +38,14 @@ pub(crate) fn measure_peaks(py: Python<'_>, num_threads: usize) -> PyResult<Boun
                 Ok(peak::macs_per_second(isa, arithmetic, num_threads))
             })?)?;
             of_isa.set_item(name, rate)?;
+            kernels_of_isa.set_item(name, peak::kernel_name(isa, arithmetic))?;
         }
         rates.set_item(isa.to_string(), of_isa)?;
+        kernels.set_item(isa.to_string(), kernels_of_isa)?;
     }
     let peaks = PyDict::new(py);
     peaks.set_item("macs_per_second", rates)?;
+    peaks.set_item("kernels", kernels)?;
     let (by_streams, mut fastest) = (PyDict::new(py), 0.0);
     for streams in peak::READ_STREAMS {
         let read = call(py, || Ok(peak::read_bytes_per_second(num_threads, streams)))?;
@@ -116,6 +119,17 @@ impl PyProfile {
     /// `(calls, seconds, multiply_adds, bytes)` by part, once the context is left.
     fn counters<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
         counters(py, &self.counted)
+    }
+
+    /// The names of the kernels of linear layers by part, once the context is left.
+    fn kernels<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
+        let dict = PyDict::new(py);
+        for part in Part::ALL {
+            if let Some(kernel) = self.counted.part(part).kernel {
+                dict.set_item(part.name(), kernel)?;
+            }
+        }
+        Ok(dict)
     }
 }
 

@@ -63,11 +63,6 @@ impl<T: Zeroable + Copy> AlignedBuffer<T> {
         Ok(buffer)
     }
 
-    /// A pointer to the first element.
-    pub(crate) fn pointer(&mut self) -> *mut T {
-        self.as_mut_ptr()
-    }
-
     /// A copy.
     pub(crate) fn try_clone(&self) -> Result<Self, AllocError> {
         let mut copy = Self::zeroed(self.len)?;

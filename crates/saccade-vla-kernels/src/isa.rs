@@ -4,33 +4,39 @@ use std::fmt;
 use std::str::FromStr;
 
 use crate::cpu::tiles::{Refusal, permission};
-use crate::gemm::amx::{InTiles, Pairs, Quads};
-use crate::gemm::broadcast::{Plain, RoundedRows, Widened};
+use crate::gemm::elements::{F32, Int8, RoundedBf16, WidenedBf16};
+use crate::gemm::in_vectors::InVectors;
+#[cfg(target_arch = "aarch64")]
+use crate::gemm::neon::{DotprodInt8, I8mmInt8, Lanes, MatrixBf16, WideningInt8};
+use crate::gemm::{Gemm, available};
 #[allow(
     unused_imports,
-    reason = "not every architecture has an instruction set with such products"
+    reason = "not every architecture and set of features has such products"
 )]
-use crate::gemm::dot_bf16::DotBf16;
-use crate::gemm::dot_int8::DotInt8;
-#[cfg(target_arch = "aarch64")]
-use crate::gemm::neon::{
-    bf16::Bfmmla,
-    float32::{Float32, RoundedBf16, WidenedBf16},
-    int8::{Sdot, Usmmla, Widening},
-};
-use crate::gemm::{Gemm, Product, available};
+use crate::gemm::{elements::Bf16, in_tiles::InTiles};
 #[cfg(target_arch = "aarch64")]
 use crate::simd::aarch64::neon::{Neon, NeonBf16, NeonDotprod, NeonI8mm};
-use crate::simd::portable::{Loops, Portable};
+use crate::simd::portable::Portable;
 #[cfg(target_arch = "x86_64")]
 use crate::simd::x86_64::{
     avx2::{Avx2, Avx2EvexVnni, Avx2VexVnni},
     avx512::{Avx512, Avx512Amx, Avx512Bf16, Avx512Vnni},
 };
-use crate::simd::{Dot, Dots, Kernel, MAX_LANES, MAX_TILE_ROWS, Simd, Vector};
+use crate::simd::{Kernel, MAX_LANES, MAX_TILE_ROWS, Simd};
+use crate::tiles::TileKernel;
+#[allow(
+    unused_imports,
+    reason = "not every architecture and set of features has tiles"
+)]
+use crate::tiles::TileUnit;
 #[cfg(target_arch = "x86_64")]
 use crate::tiles::amx::Amx;
-use crate::tiles::{Software, TILE, TileKernel, TileUnit};
+use crate::weights::{Arithmetic, Element};
+#[cfg(feature = "software-tiles")]
+use crate::{
+    simd::portable::Loops,
+    tiles::{Software, TILE},
+};
 
 /// Environment variable that forces an instruction set, so that every path can be tested on one machine.
 pub const ISA_VARIABLE: &str = "SACCADE_ISA";
@@ -46,9 +52,10 @@ macro_rules! of_vectors_unless {
 }
 
 /// A line is an instruction set by the name that users give it, slowest first: `Name = "name" if CONDITION { ... }`, and in the braces
+/// (`of "feature"` before the condition: only there where the crate has this feature)
 /// - `vectors`: what every kernel runs on;
-/// - `bf16`, `int8`: instruction sets with the same vectors and an instruction for dot products of these elements, of which a kernel for
-///   such products uses the first that the CPU has, and else `vectors`;
+/// - `bf16`, `int8`: instruction sets with the same vectors and an instruction for dot products of these elements; a kernel for dot products
+///   of bfloat16 uses the first of `bf16` that the CPU has, and else `vectors`;
 /// - `gemm_bf16`, `gemm_int8`: products with packed weights of these elements, likewise; those after the last one listed are made of
 ///   `vectors` alone;
 /// - `needs`: of these types, the CPU must have at least one;
@@ -58,7 +65,7 @@ macro_rules! of_vectors_unless {
 macro_rules! instruction_sets {
     ($(
         $(#[$doc:meta])*
-        $isa:ident = $name:literal if $condition:meta {
+        $isa:ident = $name:literal $(of $feature:literal)? if $condition:meta {
             vectors: $vectors:ty,
             bf16: [$($bf16:ty),*],
             int8: [$($int8:ty),*],
@@ -79,17 +86,17 @@ macro_rules! instruction_sets {
         #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
         #[non_exhaustive]
         pub enum Isa {
-            $($(#[$doc])* $isa,)+
+            $($(#[$doc])* $(#[cfg(feature = $feature)])? $isa,)+
         }
 
-        const ALL: &[Isa] = &[$(Isa::$isa),+];
+        const ALL: &[Isa] = &[$($(#[cfg(feature = $feature)])? Isa::$isa),+];
 
-        $(#[cfg($condition)] const _: () = Vectors::of::<<$vectors as Simd>::Vector>().check();)+
+        $(#[cfg($condition)] const _: () = Vectors::of::<$vectors>().check();)+
 
         impl Isa {
             fn name(self) -> &'static str {
                 match self {
-                    $(Self::$isa => $name,)+
+                    $($(#[cfg(feature = $feature)])? Self::$isa => $name,)+
                 }
             }
 
@@ -104,14 +111,14 @@ macro_rules! instruction_sets {
                 }
             }
 
-            /// The instruction for `dot` that this instruction set uses on this CPU.
-            fn dot_product(self, dot: Dot) -> Option<&'static str> {
+            /// The instructions for dot products of bfloat16 and of int8 that it uses on this CPU.
+            fn dots(self) -> [Option<&'static str>; 2] {
                 match self {
-                    $(#[cfg($condition)] Self::$isa if self.is_available() => match dot {
-                        Dot::Bf16 => None $(.or_else(name_of::<$bf16>))*,
-                        Dot::Int8 => None $(.or_else(name_of::<$int8>))*,
-                    },)+
-                    _ => None,
+                    $(#[cfg($condition)] Self::$isa if self.is_available() => [
+                        None $(.or_else(name_of::<$bf16>))*,
+                        None $(.or_else(name_of::<$int8>))*,
+                    ],)+
+                    _ => [None; 2],
                 }
             }
 
@@ -121,13 +128,13 @@ macro_rules! instruction_sets {
             /// If no CPU of this architecture has it.
             pub(crate) fn vectors(self) -> Vectors {
                 match self {
-                    $(#[cfg($condition)] Self::$isa => Vectors::of::<<$vectors as Simd>::Vector>(),)+
-                    #[allow(unreachable_patterns, reason = "as above")]
+                    $(#[cfg($condition)] Self::$isa => Vectors::of::<$vectors>(),)+
+                    #[allow(unreachable_patterns, reason = "on some architectures all of them are there")]
                     _ => self.is_missing(),
                 }
             }
 
-            /// Runs a kernel on it, with the dot products that the kernel wants where there are any.
+            /// Runs a kernel on it, with dot products of bfloat16 if the kernel uses them and there are any.
             ///
             /// # Panics
             /// If this CPU lacks it: looking is a few loads, and makes every kernel sound.
@@ -135,15 +142,9 @@ macro_rules! instruction_sets {
             pub(crate) fn run<K: Kernel>(self, kernel: K) -> K::Output {
                 match self {
                     $(#[cfg($condition)] Self::$isa if self.is_available() => {
-                        match K::DOTS {
-                            None => {}
-                            Some(Dot::Bf16) => {
-                                $(if let Some(simd) = <$bf16 as Simd>::new() { return simd.run(kernel); })*
-                            }
-                            Some(Dot::Int8) => {
-                                $(if let Some(simd) = <$int8 as Simd>::new() { return simd.run(kernel); })*
-                            }
-                        }
+                        $(if K::USES_DOT_BF16 && let Some(simd) = <$bf16 as Simd>::new() {
+                            return simd.run(kernel);
+                        })*
                         match <$vectors as Simd>::new() {
                             Some(simd) => simd.run(kernel),
                             None => self.is_missing(),
@@ -171,25 +172,28 @@ macro_rules! instruction_sets {
                         Some(unit) => kernel.run(unit),
                         None => self.is_missing(),
                     },)?)+
-                    _ => self.is_missing(),
+                    _ => {
+                        drop(kernel);
+                        self.is_missing()
+                    }
                 }
             }
 
-            /// What multiplies rows by packed weights.
+            /// What multiplies rows by packed weights, which are given as `weights`.
             ///
             /// # Panics
             /// If this CPU lacks it.
-            pub(crate) fn gemm(self, product: Product) -> Box<dyn Gemm> {
+            pub(crate) fn gemm(self, arithmetic: Arithmetic, weights: Element) -> Box<dyn Gemm> {
                 let found: Option<Box<dyn Gemm>> = match self {
-                    $(#[cfg($condition)] Self::$isa if self.is_available() => match product {
-                        Product::Float32 => None $(.or_else(available::<$gemm_f32>))?
-                            .or_else(|| of_vectors_unless!([$($gemm_f32)?] Plain<$vectors>)),
-                        Product::WidenedBf16 => None $(.or_else(available::<$gemm_widened>))?
-                            .or_else(|| of_vectors_unless!([$($gemm_f32)?] Widened<$vectors>)),
-                        Product::Bf16 => None $(.or_else(available::<$gemm_bf16>))*
-                            .or_else(|| of_vectors_unless!([$($gemm_f32)?] RoundedRows<$vectors>)),
-                        Product::Int8 => None $(.or_else(available::<$gemm_int8>))*
-                            .or_else(|| of_vectors_unless!([$($gemm_f32)?] DotInt8<$vectors>)),
+                    $(#[cfg($condition)] Self::$isa if self.is_available() => match (arithmetic, weights) {
+                        (Arithmetic::Float32, Element::Bf16) => None $(.or_else(available::<$gemm_widened>))?
+                            .or_else(|| of_vectors_unless!([$($gemm_f32)?] InVectors<$vectors, WidenedBf16>)),
+                        (Arithmetic::Float32, _) => None $(.or_else(available::<$gemm_f32>))?
+                            .or_else(|| of_vectors_unless!([$($gemm_f32)?] InVectors<$vectors, F32>)),
+                        (Arithmetic::Bfloat16, _) => None $(.or_else(available::<$gemm_bf16>))*
+                            .or_else(|| of_vectors_unless!([$($gemm_f32)?] InVectors<$vectors, RoundedBf16>)),
+                        (Arithmetic::Int8, _) => None $(.or_else(available::<$gemm_int8>))*
+                            .or_else(|| of_vectors_unless!([$($gemm_f32)?] InVectors<$vectors, Int8>)),
                     },)+
                     _ => None,
                 };
@@ -214,7 +218,7 @@ instruction_sets! {
         bf16: [],
         int8: [Avx2VexVnni, Avx2EvexVnni],
         gemm_bf16: [],
-        gemm_int8: [DotInt8<Avx2VexVnni>, DotInt8<Avx2EvexVnni>],
+        gemm_int8: [InVectors<Avx2VexVnni, Int8>, InVectors<Avx2EvexVnni, Int8>],
         needs: [Avx2VexVnni, Avx2EvexVnni],
     }
     /// AVX-512 F, VL, BW and DQ, without dot products.
@@ -226,19 +230,19 @@ instruction_sets! {
         vectors: Avx512,
         bf16: [Avx512Bf16],
         int8: [Avx512Vnni],
-        gemm_bf16: [DotBf16<Avx512Bf16>],
-        gemm_int8: [DotInt8<Avx512Vnni>],
+        gemm_bf16: [InVectors<Avx512Bf16, Bf16>],
+        gemm_int8: [InVectors<Avx512Vnni, Int8>],
         needs: [Avx512],
     }
     /// Tiles in software: what [`Isa::Amx`] computes, bit for bit but for the vectors beside the tiles, at the speed of an emulator. For
     /// tests; never chosen, and not among [`Isa::available`].
     #[doc(hidden)]
-    SoftwareTiles = "software_tiles" if all() {
+    SoftwareTiles = "software_tiles" of "software-tiles" if feature = "software-tiles" {
         vectors: Loops<TILE>,
         bf16: [],
         int8: [],
-        gemm_bf16: [InTiles<Software, Pairs>],
-        gemm_int8: [InTiles<Software, Quads>],
+        gemm_bf16: [InTiles<Software, Bf16>],
+        gemm_int8: [InTiles<Software, Int8>],
         needs: [Loops<TILE>],
         tiles: Software,
     }
@@ -247,8 +251,8 @@ instruction_sets! {
         vectors: Avx512,
         bf16: [Avx512Amx],
         int8: [Avx512Vnni],
-        gemm_bf16: [InTiles<Amx, Pairs>],
-        gemm_int8: [InTiles<Amx, Quads>],
+        gemm_bf16: [InTiles<Amx, Bf16>],
+        gemm_int8: [InTiles<Amx, Int8>],
         needs: [Avx512Amx],
         tiles: Amx,
     }
@@ -257,50 +261,54 @@ instruction_sets! {
         vectors: Neon,
         bf16: [],
         int8: [],
-        gemm_bf16: [RoundedBf16],
-        gemm_int8: [Widening],
+        gemm_bf16: [InVectors<Neon, RoundedBf16, Lanes>],
+        gemm_int8: [InVectors<Neon, WideningInt8, Lanes>],
         needs: [Neon],
-        gemm_f32: Float32,
-        gemm_widened: WidenedBf16,
+        gemm_f32: InVectors<Neon, F32, Lanes>,
+        gemm_widened: InVectors<Neon, WidenedBf16, Lanes>,
     }
     /// NEON with dot products of int8.
     Dotprod = "dotprod" if target_arch = "aarch64" {
         vectors: Neon,
         bf16: [],
         int8: [NeonDotprod],
-        gemm_bf16: [RoundedBf16],
-        gemm_int8: [Sdot],
+        gemm_bf16: [InVectors<Neon, RoundedBf16, Lanes>],
+        gemm_int8: [InVectors<NeonDotprod, DotprodInt8, Lanes>],
         needs: [NeonDotprod],
-        gemm_f32: Float32,
-        gemm_widened: WidenedBf16,
+        gemm_f32: InVectors<Neon, F32, Lanes>,
+        gemm_widened: InVectors<Neon, WidenedBf16, Lanes>,
     }
     /// NEON with products of matrices of int8.
     I8mm = "i8mm" if target_arch = "aarch64" {
         vectors: Neon,
         bf16: [],
         int8: [NeonI8mm],
-        gemm_bf16: [RoundedBf16],
-        gemm_int8: [Usmmla],
+        gemm_bf16: [InVectors<Neon, RoundedBf16, Lanes>],
+        gemm_int8: [InVectors<NeonI8mm, I8mmInt8, Lanes>],
         needs: [NeonI8mm],
-        gemm_f32: Float32,
-        gemm_widened: WidenedBf16,
+        gemm_f32: InVectors<Neon, F32, Lanes>,
+        gemm_widened: InVectors<Neon, WidenedBf16, Lanes>,
     }
     /// NEON with products of bfloat16, and whichever of int8 this CPU has.
     Bf16 = "bf16" if target_arch = "aarch64" {
         vectors: Neon,
         bf16: [NeonBf16],
         int8: [NeonI8mm, NeonDotprod],
-        gemm_bf16: [Bfmmla],
-        gemm_int8: [Usmmla, Sdot, Widening],
+        gemm_bf16: [InVectors<NeonBf16, MatrixBf16, Lanes>],
+        gemm_int8: [
+            InVectors<NeonI8mm, I8mmInt8, Lanes>,
+            InVectors<NeonDotprod, DotprodInt8, Lanes>,
+            InVectors<Neon, WideningInt8, Lanes>
+        ],
         needs: [NeonBf16],
-        gemm_f32: Float32,
-        gemm_widened: WidenedBf16,
+        gemm_f32: InVectors<Neon, F32, Lanes>,
+        gemm_widened: InVectors<Neon, WidenedBf16, Lanes>,
     }
 }
 
 /// What users call the instructions of `S`, where this CPU has them.
 fn name_of<S: Simd>() -> Option<&'static str> {
-    S::new().map(|_| <S::Dots as Dots<S::Vector>>::NAME)
+    S::new().map(|_| S::DOT_NAME)
 }
 
 /// Sizes that data are laid out by.
@@ -313,14 +321,14 @@ pub(crate) struct Vectors {
 }
 
 impl Vectors {
-    const fn of<V: Vector>() -> Self {
+    const fn of<S: Simd>() -> Self {
         Self {
-            lanes: V::LANES,
-            tile_rows: V::TILE_ROWS,
+            lanes: S::LANES,
+            tile_rows: S::TILE_ROWS,
         }
     }
 
-    /// That kernels have room for them.
+    /// Checks that kernels have room for them.
     const fn check(&self) {
         assert!(self.lanes <= MAX_LANES && self.tile_rows >= 1 && self.tile_rows <= MAX_TILE_ROWS);
     }
@@ -331,7 +339,7 @@ impl Vectors {
 #[error("{ISA_VARIABLE}: expected one of {}, got `{given}`{why}", names(&Isa::available()))]
 pub struct IsaError {
     given: String,
-    /// Why not, from a comma on; empty where the name is unknown.
+    /// The reason, with its punctuation (`, ...`); empty for an unknown name.
     why: String,
 }
 
@@ -347,8 +355,13 @@ impl Isa {
     pub fn available() -> Vec<Self> {
         ALL.iter()
             .copied()
-            .filter(|&isa| isa != Self::SoftwareTiles && isa.is_available())
+            .filter(|isa| !isa.is_emulated() && isa.is_available())
             .collect()
+    }
+
+    /// Whether it is for tests alone.
+    fn is_emulated(self) -> bool {
+        self.name() == "software_tiles"
     }
 
     /// The dot products that it uses on this CPU: `bf16` (of bfloat16); `vnni`, `dotprod` or `i8mm` (of int8); in tiles, for [`Isa::Amx`].
@@ -358,8 +371,7 @@ impl Isa {
     /// ```
     #[must_use]
     pub fn dot_products(self) -> Vec<&'static str> {
-        let dots = [Dot::Bf16, Dot::Int8].into_iter();
-        dots.filter_map(|dot| self.dot_product(dot)).collect()
+        self.dots().into_iter().flatten().collect()
     }
 
     /// The one that `SACCADE_ISA` names; the best where it is unset or empty.

@@ -28,6 +28,7 @@ mod linear;
 mod matrix;
 mod norm;
 mod parts;
+#[cfg(feature = "peak")]
 pub mod peak;
 mod pool;
 mod rope;
@@ -35,6 +36,10 @@ mod rows;
 #[allow(dead_code, reason = "kernels move to its tokens one by one")]
 mod simd;
 mod threads;
+#[cfg_attr(
+    not(any(target_arch = "x86_64", feature = "software-tiles")),
+    allow(dead_code, reason = "no unit multiplies tiles there")
+)]
 mod tiles;
 mod weights;
 

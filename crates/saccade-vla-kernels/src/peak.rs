@@ -1,4 +1,4 @@
-//! What this CPU can do at most: multiply-accumulates from registers, the clock they run at, and reading memory. Kernels are compared with it.
+//! What this CPU can do at most: multiply-accumulates without memory, the clock they run at, and reading memory. Kernels are compared with it.
 
 use std::hint::black_box;
 use std::io;
@@ -8,11 +8,10 @@ use std::thread::Builder;
 use std::time::Instant;
 
 use crate::aligned::{AlignedBuffer, AllocError};
-use crate::gemm::Product;
 use crate::isa::Isa;
 use crate::pool::has_room_for_thread;
-use crate::simd::{Kernel, Simd, Vector};
-use crate::weights::Arithmetic;
+use crate::simd::{Kernel, Simd};
+use crate::weights::{Arithmetic, Element};
 
 /// Calls of which the fastest counts: what disturbs a machine makes some of them slow, never fast.
 const CALLS: usize = 10;
@@ -42,7 +41,7 @@ pub enum PeakError {
 }
 
 /// The most multiply-accumulates a second that the kernels of `isa` and `arithmetic` could do on `threads` threads, measured in a few
-/// hundredths of a second: independent chains of the instruction that they are made of, without any memory.
+/// hundredths of a second: the micro-kernels' steps, again and again, with rows and weights in the nearest cache.
 ///
 /// Where there is no instruction for bfloat16, it is widened to float32 and has the same peak.
 ///
@@ -67,12 +66,17 @@ pub fn macs_per_second(isa: Isa, arithmetic: Arithmetic, threads: usize) -> Resu
 /// # Panics
 /// As [`macs_per_second`].
 pub fn multiply_accumulate(isa: Isa, arithmetic: Arithmetic, threads: usize) -> Result<usize, PeakError> {
-    let gemm = isa.gemm(match arithmetic {
-        Arithmetic::Float32 => Product::Float32,
-        Arithmetic::Bfloat16 => Product::Bf16,
-        Arithmetic::Int8 => Product::Int8,
-    });
-    on_threads(threads, &|_| gemm.chains())
+    let gemm = isa.gemm(arithmetic, Element::F32);
+    on_threads(threads, &|_| gemm.multiply_for_peak())
+}
+
+/// The name of the kernel whose peak [`macs_per_second`] is, as in `avx512-vnni-int8`.
+///
+/// # Panics
+/// If this CPU lacks `isa`.
+#[must_use]
+pub fn kernel_name(isa: Isa, arithmetic: Arithmetic) -> &'static str {
+    isa.gemm(arithmetic, Element::F32).name()
 }
 
 /// Bytes a second that `threads` threads read from memory together, each of them as `streams` streams: a few lines of each in turn. Takes a
@@ -155,25 +159,20 @@ impl Kernel for Read<'_> {
     type Output = usize;
 
     #[inline(always)]
-    fn run<S: Simd>(self, _: S) -> usize {
+    fn run<S: Simd>(self, simd: S) -> usize {
         const VECTORS: usize = 8;
-        let lanes = S::Vector::LANES;
-        let turn = VECTORS * lanes;
+        let turn = VECTORS * S::LANES;
         let turns = self.words.len() / self.streams / turn;
-        // SAFETY: all streams together have as many turns of words; the caller has the instruction set.
-        unsafe {
-            let mut sums = [S::Vector::splat_int(0); VECTORS];
-            for index in 0..turns {
-                for stream in 0..self.streams {
-                    let words = self.words.as_ptr().add((stream * turns + index) * turn);
-                    for (vector, sum) in sums.iter_mut().enumerate() {
-                        let words = S::Vector::load_ints(words.add(vector * lanes).cast());
-                        *sum = S::Vector::add_ints(*sum, words);
-                    }
+        let mut sums = [simd.splat_i32(0); VECTORS];
+        for index in 0..turns {
+            for stream in 0..self.streams {
+                let words = &self.words[(stream * turns + index) * turn..][..turn];
+                for (sum, words) in sums.iter_mut().zip(words.chunks_exact(S::LANES)) {
+                    *sum = simd.add_i32(*sum, simd.load_words(words));
                 }
             }
-            black_box(&sums);
         }
+        black_box(&sums);
         turns * self.streams * turn
     }
 }
@@ -227,16 +226,21 @@ mod tests {
         for isa in Isa::available() {
             let [float, bf16, int8] = [Arithmetic::Float32, Arithmetic::Bfloat16, Arithmetic::Int8]
                 .map(|arithmetic| multiply_accumulate(isa, arithmetic, 1).unwrap());
-            // An instruction does so many times the products of one of float32.
+            // A step does so many 28th of the multiply-adds of one of float32.
             let expected = match (isa, &isa.dot_products()[..]) {
-                // Six products of 16 x 16 x 16 words next to a dozen of vectors, in an eighth of the iterations.
-                (Isa::Amx, _) => [32, 64],
-                (_, ["bf16", "i8mm"]) => [4, 8],
-                (_, ["i8mm"]) => [1, 8],
-                (_, ["bf16", ..]) => [2, 4],
-                _ => [1, 4],
+                // Six products of 16 x 16 x 16 words next to a dozen of vectors, in an eighth of the steps.
+                (Isa::Amx, _) => [28 * 32, 28 * 64],
+                // Rows of a tile times `k` of a step: seven times four of float32, eight times four of bfloat16.
+                (Isa::Neon, _) => [28, 5 * 16],
+                (Isa::Dotprod, _) => [28, 6 * 16],
+                (Isa::I8mm, _) => [28, 8 * 8],
+                (Isa::Bf16, ["bf16", "i8mm"]) => [8 * 4, 8 * 8],
+                (Isa::Bf16, ["bf16", "dotprod"]) => [8 * 4, 6 * 16],
+                (Isa::Bf16, _) => [8 * 4, 5 * 16],
+                (_, ["bf16", ..]) => [28 * 2, 28 * 4],
+                _ => [28, 28 * 4],
             };
-            assert_eq!([bf16 / float, int8 / float], expected, "{isa}");
+            assert_eq!([28 * bf16 / float, 28 * int8 / float], expected, "{isa}");
             assert_eq!(
                 multiply_accumulate(isa, Arithmetic::Float32, 2).unwrap(),
                 2 * float,

@@ -280,7 +280,6 @@ impl<'a, T> Rows<'a, T> {
 
 impl<'a> Rows<'a> {
     /// The same rows as words.
-    #[allow(dead_code, reason = "linear layers will use it")]
     pub(crate) fn bits(self) -> Rows<'a, u32> {
         Rows::of(self.first.cast(), self.shape)
     }

@@ -71,8 +71,10 @@ pub use rewrite::{
     RewriteOptions, Written, convert, merge_future_tokens, open_base, quantize, resize, resized_config,
 };
 pub use saccade_vla_checkpoint::{self as files, Checkpoint, Elements};
+#[cfg(feature = "peak")]
+pub use saccade_vla_kernels::peak;
 pub use saccade_vla_kernels::{
-    Arithmetic, CpuReport, Isa, StayOnThisThread, default_num_threads, peak, stay_on_this_thread,
+    Arithmetic, CpuReport, Isa, StayOnThisThread, default_num_threads, stay_on_this_thread,
 };
 pub use sampling::chunking::Chunking;
 pub use sampling::integrator::Integrator;

@@ -6,7 +6,7 @@ use saccade_vla_kernels::{
 
 use crate::engine::Engine;
 use crate::error::{Error, Result};
-use crate::profile::{Part, counted};
+use crate::profile::{Part, counted, counted_by};
 
 /// Runs `work`, and asks `poll` every 20 ms or so whether to stop it.
 ///
@@ -73,7 +73,8 @@ pub(crate) fn linear(
 ) -> Result<()> {
     let (x, out) = (rows(x, layer.in_features()), rows_mut(out, layer.out_features()));
     let multiply_adds = x.num_rows() * layer.in_features() * layer.out_features();
-    let applied = counted(part, (multiply_adds, layer.nbytes()), || {
+    let (kernel, work) = (layer.kernel_name(), (multiply_adds, layer.nbytes()));
+    let applied = counted_by(Some(kernel), part, work, || {
         layer.apply(threads, x, epilogue, out, scratch)
     });
     applied.map_err(refused("activations"))?;

@@ -86,6 +86,8 @@ pub struct Counter {
     pub multiply_adds: u64,
     /// Bytes of weights, or of held keys and values, that they read at least once.
     pub bytes: u64,
+    /// The kernel of the last call, of parts that are linear layers: `avx512-vnni-int8`, for example.
+    pub kernel: Option<&'static str>,
 }
 
 /// Counters of every part.
@@ -101,6 +103,7 @@ impl Profile {
             time: Duration::ZERO,
             multiply_adds: 0,
             bytes: 0,
+            kernel: None,
         }; Part::ALL.len()],
     };
 
@@ -139,6 +142,7 @@ impl Profiling {
             counter.time -= before.time;
             counter.multiply_adds -= before.multiply_adds;
             counter.bytes -= before.bytes;
+            counter.kernel = counter.kernel.filter(|_| counter.calls > 0);
         }
         Profile { counters }
     }
@@ -159,6 +163,16 @@ thread_local! {
 
 /// Runs `call`, whose work is `(multiply_adds, bytes)`, and counts it under `part` if this thread counts.
 pub(crate) fn counted<R>(part: Option<Part>, work: (usize, usize), call: impl FnOnce() -> R) -> R {
+    counted_by(None, part, work, call)
+}
+
+/// The same of a call that `kernel` computes.
+pub(crate) fn counted_by<R>(
+    kernel: Option<&'static str>,
+    part: Option<Part>,
+    work: (usize, usize),
+    call: impl FnOnce() -> R,
+) -> R {
     let Some(part) = part.filter(|_| GUARDS.get() > 0) else {
         return call();
     };
@@ -171,6 +185,7 @@ pub(crate) fn counted<R>(part: Option<Part>, work: (usize, usize), call: impl Fn
         counter.time += time;
         counter.multiply_adds += work.0 as u64;
         counter.bytes += work.1 as u64;
+        counter.kernel = kernel.or(counter.kernel);
     });
     result
 }

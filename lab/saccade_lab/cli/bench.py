@@ -244,6 +244,7 @@ def profile_of(part: str, counter: Counter, precision: str, machine: Machine) ->
         "floor_seconds": floor,
         "limit": machine.limit(arithmetic, counter.multiply_adds, counter.num_bytes),
         "share": floor / counter.seconds if counter.multiply_adds else None,
+        "kernel": counter.kernel,
     }
 
 
@@ -260,6 +261,7 @@ def tables(report: dict[str, Any]) -> str:
         f"machine   {machine['isa']}, {machine['num_threads']} threads; peak GMAC/s {peaks}; "
         f"read {machine['read_bytes_per_second'] / 1e9:.1f} GB/s ({reading}); "
         f"saccade {report['saccade']}",
+        f"kernels   {', '.join(machine['kernels'].values())}",
         "",
         f"median (quartiles) of {report['rounds']} rounds, ms",
         f"{'':<20}{'time':>9}{'quartiles':>20}{'GMAC':>9}{'floor':>9}{'of it':>8}",
@@ -281,13 +283,13 @@ def profile_table(one: dict[str, Any]) -> list[str]:
         "",
         f"{one['precision']} {one['call']}, by part",
         f"{'':<20}{'calls':>7}{'ms':>10}{'of all':>8}{'GMAC':>9}{'MB read':>10}{'floor':>9}"
-        f"{'of it':>8}  limit",
+        f"{'of it':>8}  {'limit':<12}kernel",
     ]
     for part in one["parts"]:
         seconds, least = part["seconds"], 1e3 * part["floor_seconds"]
         gmac, megabytes = part["multiply_adds"] / 1e9, part["bytes"] / 1e6
         reached = "" if part["share"] is None else f"{part['share']:.0%}"
-        bound = "" if part["share"] is None else f"  {part['limit']}"
+        bound = "" if part["share"] is None else f"  {part['limit']:<12}{part['kernel']}".rstrip()
         lines.append(
             f"{part['part']:<20}{part['calls']:>7}{1e3 * seconds:>10.3f}{seconds / whole:>8.1%}"
             f"{gmac:>9.3f}{megabytes:>10.1f}{least:>9.3f}{reached:>8}{bound}"

@@ -43,6 +43,11 @@ def test_peaks_of_this_machine() -> None:
     peaks = _saccade.measure_peaks(1)
     assert list(peaks["macs_per_second"]) == _saccade.available_isas()
     assert all(set(rates) == set(PRECISIONS) for rates in peaks["macs_per_second"].values())
+    assert peaks["kernels"]["portable"] == {
+        "float32": "portable-f32",
+        "bfloat16": "portable-bf16-as-f32",
+        "int8": "portable-int8",
+    }
     assert list(peaks["read_bytes_per_second_by_streams"]) == [1, 16]
     assert peaks["read_bytes_per_second"] == max(peaks["read_bytes_per_second_by_streams"].values()) > 0
     with pytest.raises(saccade.InputError, match="num_threads: expected at least 1, got 0"):
@@ -120,6 +125,10 @@ def test_json_has_times_and_profile(capsys: pytest.CaptureFixture[str], folder: 
         "num_image_tokens": None,
     }
     assert report["machine"]["num_threads"] == 1
+    assert set(report["machine"]["kernels"]) == set(PRECISIONS)
+    kernels = {part["part"]: part["kernel"] for one in report["profile"] for part in one["parts"]}
+    assert kernels["to_q"] == report["machine"]["kernels"]["float32"]
+    assert kernels["attention"] == ""
     assert set(report["machine"]["macs_per_second"]) == set(PRECISIONS)
     works = {one["call"]: sum(part["multiply_adds"] for part in one["parts"]) for one in report["profile"]}
     assert list(works) == ["encode", "sample"]
@@ -143,6 +152,7 @@ def test_software_tiles_can_be_measured(
     sizes = ("--num-vl-tokens", "3", "--num-steps", "1", "--rounds", "1", "--num-threads", "1")
     machine = printed(capsys, "--checkpoint", str(folder), *sizes)["machine"]
     assert machine["isa"] == "software_tiles"
+    assert machine["kernels"]["int8"] == "software-tiles-int8"
     assert min(machine["macs_per_second"][precision] for precision in PRECISIONS) > 0
 
 

@@ -2,7 +2,7 @@
 
 use crate::rows::Rows;
 use crate::simd::bits::write;
-use crate::simd::{Dot, Kernel, MAX_LANES, Simd};
+use crate::simd::{Kernel, MAX_LANES, Simd};
 
 /// The keys and values of one head, and where they go.
 pub(super) struct Head<'a> {
@@ -35,7 +35,7 @@ impl Kernel for PackF32<'_> {
 
 impl Kernel for PackBf16<'_> {
     type Output = bool;
-    const DOTS: Option<Dot> = Some(Dot::Bf16);
+    const USES_DOT_BF16: bool = true;
 
     #[inline(always)]
     fn run<S: Simd>(self, simd: S) -> bool {

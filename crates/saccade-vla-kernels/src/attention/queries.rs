@@ -11,7 +11,7 @@ use super::product::{AttentionProduct, InVectors, Multiply, Operands, Removed};
 use super::softmax::{Row, Running};
 use crate::rows::{Rows, RowsMut};
 use crate::simd::bits::write_uninit;
-use crate::simd::{Dot, Kernel, LINE, MAX_TILE_ROWS, Simd};
+use crate::simd::{Kernel, LINE, MAX_TILE_ROWS, Simd};
 use crate::tiles::{MAX_ROWS, Session, TileKernel, TileUnit};
 
 /// Keys between two updates of a query's running maximum, at most: whole pairs of vectors of every
@@ -65,7 +65,7 @@ impl Kernel for AttendF32<'_> {
 
 impl Kernel for AttendBf16<'_> {
     type Output = ();
-    const DOTS: Option<Dot> = Some(Dot::Bf16);
+    const USES_DOT_BF16: bool = true;
 
     #[inline(always)]
     fn run<S: Simd>(mut self, simd: S) {

@@ -1,4 +1,4 @@
-//! Vendor, family, model and stepping, as CPUID gives them.
+//! Vendor, family and model, as CPUID gives them.
 
 use std::fmt;
 
@@ -10,17 +10,16 @@ pub(crate) enum Vendor {
     Other,
 }
 
-/// What tells CPUs of one vendor apart.
+/// A CPU's vendor and its numbers.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct Signature {
     pub vendor: Vendor,
     pub family: u32,
     pub model: u32,
-    pub stepping: u32,
 }
 
 impl Signature {
-    /// That of this CPU; `None` where there is no CPUID.
+    /// This CPU's; `None` where there is no CPUID.
     pub(super) fn current() -> Option<Self> {
         #[cfg(target_arch = "x86_64")]
         {
@@ -56,7 +55,6 @@ impl Signature {
             } else {
                 model
             },
-            stepping: field(0, 4),
         }
     }
 }
@@ -78,12 +76,11 @@ impl fmt::Display for Signature {
 
 /// For tests.
 #[cfg(test)]
-pub(super) fn signature(vendor: Vendor, family: u32, model: u32, stepping: u32) -> Signature {
+pub(super) fn signature(vendor: Vendor, family: u32, model: u32) -> Signature {
     Signature {
         vendor,
         family,
         model,
-        stepping,
     }
 }
 
@@ -98,17 +95,17 @@ mod tests {
         let intel = [word(b"Genu"), word(b"ineI"), word(b"ntel")];
         let amd = [word(b"Auth"), word(b"enti"), word(b"cAMD")];
         for (vendor, version, expected) in [
-            (intel, 0x000806f8, signature(Vendor::Intel, 6, 0x8f, 8)), // Xeon 8480
-            (intel, 0x000c06f2, signature(Vendor::Intel, 6, 0xcf, 2)), // Xeon 8592
-            (intel, 0x000a06d1, signature(Vendor::Intel, 6, 0xad, 1)), // Xeon 6980P
-            (intel, 0x000606a6, signature(Vendor::Intel, 6, 0x6a, 6)), // Xeon 8380
-            (intel, 0x00050657, signature(Vendor::Intel, 6, 0x55, 7)), // Xeon 8280
-            (intel, 0x0005065b, signature(Vendor::Intel, 6, 0x55, 11)), // Xeon 8380H
-            (intel, 0x00090672, signature(Vendor::Intel, 6, 0x97, 2)), // Core i9-12900K
-            (amd, 0x00a00f11, signature(Vendor::Amd, 25, 1, 1)),       // EPYC 7763
-            (amd, 0x00a10f11, signature(Vendor::Amd, 25, 17, 1)),      // EPYC 9654
-            (amd, 0x00b00f21, signature(Vendor::Amd, 26, 2, 1)),       // EPYC 9755
-            ([0; 3], 0, signature(Vendor::Other, 0, 0, 0)),
+            (intel, 0x000806f8, signature(Vendor::Intel, 6, 0x8f)), // Xeon 8480
+            (intel, 0x000c06f2, signature(Vendor::Intel, 6, 0xcf)), // Xeon 8592
+            (intel, 0x000a06d1, signature(Vendor::Intel, 6, 0xad)), // Xeon 6980P
+            (intel, 0x000606a6, signature(Vendor::Intel, 6, 0x6a)), // Xeon 8380
+            (intel, 0x00050657, signature(Vendor::Intel, 6, 0x55)), // Xeon 8280
+            (intel, 0x0005065b, signature(Vendor::Intel, 6, 0x55)), // Xeon 8380H
+            (intel, 0x00090672, signature(Vendor::Intel, 6, 0x97)), // Core i9-12900K
+            (amd, 0x00a00f11, signature(Vendor::Amd, 25, 1)),       // EPYC 7763
+            (amd, 0x00a10f11, signature(Vendor::Amd, 25, 17)),      // EPYC 9654
+            (amd, 0x00b00f21, signature(Vendor::Amd, 26, 2)),       // EPYC 9755
+            ([0; 3], 0, signature(Vendor::Other, 0, 0)),
         ] {
             assert_eq!(Signature::decode(vendor, version), expected, "{version:#x}");
         }

@@ -245,89 +245,25 @@ mod tests {
     /// A request can fail a later `sigaltstack` of the program: where tiles cannot be used anyway there is none.
     #[test]
     fn nothing_is_asked_of_the_system_without_the_whole_of_amx() {
-        let complete = Told::sapphire_rapids;
-        let lacking: [(Told, Refusal); 11] = [
-            (
-                Told {
-                    features: 0,
-                    ..complete()
-                },
-                Refusal::NotThere,
-            ),
+        type Change = fn(&mut Told);
+        let lacking: [(Change, Refusal); 11] = [
+            (|told| told.features = 0, Refusal::NotThere),
             // The products are named, the tiles are masked.
-            (
-                Told {
-                    features: 1 << 22 | 1 << 25,
-                    ..complete()
-                },
-                Refusal::NotThere,
-            ),
-            (
-                Told {
-                    features: 1 << 24,
-                    ..complete()
-                },
-                Refusal::WithoutProducts,
-            ),
-            (
-                Told {
-                    features: 1 << 24 | 1 << 22,
-                    ..complete()
-                },
-                Refusal::WithoutProducts,
-            ),
-            (
-                Told {
-                    vnni: false,
-                    ..complete()
-                },
-                Refusal::WithoutVectors,
-            ),
-            (
-                Told {
-                    bf16: false,
-                    ..complete()
-                },
-                Refusal::WithoutVectors,
-            ),
-            (
-                Told {
-                    palette: [0; 4],
-                    ..complete()
-                },
-                Refusal::OtherTiles,
-            ),
-            (
-                Told {
-                    palette: [1024 << 16 | 8192, 8 << 16 | 64, 32, 0],
-                    ..complete()
-                },
-                Refusal::OtherTiles,
-            ),
-            (
-                Told {
-                    osxsave: false,
-                    ..complete()
-                },
-                Refusal::TurnedOff(0),
-            ),
+            (|told| told.features = 1 << 22 | 1 << 25, Refusal::NotThere),
+            (|told| told.features = 1 << 24, Refusal::WithoutProducts),
+            (|told| told.features = 1 << 24 | 1 << 22, Refusal::WithoutProducts),
+            (|told| told.vnni = false, Refusal::WithoutVectors),
+            (|told| told.bf16 = false, Refusal::WithoutVectors),
+            (|told| told.palette = [0; 4], Refusal::OtherTiles),
+            (|told| told.palette[2] = 32, Refusal::OtherTiles),
+            (|told| told.osxsave = false, Refusal::TurnedOff(0)),
             // A hypervisor that passes the features through and not the state; half of the state.
-            (
-                Told {
-                    xcr0: 0x2e7,
-                    ..complete()
-                },
-                Refusal::TurnedOff(0x2e7),
-            ),
-            (
-                Told {
-                    xcr0: 0x202e7,
-                    ..complete()
-                },
-                Refusal::TurnedOff(0x202e7),
-            ),
+            (|told| told.xcr0 = 0x2e7, Refusal::TurnedOff(0x2e7)),
+            (|told| told.xcr0 = 0x202e7, Refusal::TurnedOff(0x202e7)),
         ];
-        for (machine, expected) in lacking {
+        for (change, expected) in lacking {
+            let mut machine = Told::sapphire_rapids();
+            change(&mut machine);
             assert_eq!(ask(&machine), Err(expected));
             assert_eq!(machine.asked.get(), 0, "{expected}");
         }

@@ -1,7 +1,7 @@
 //! Elements of a row that are far larger than the others: kept out of its quantisation, and multiplied in float32.
 //!
-//! Models have a few channels a hundred times as large as the rest. A row that is quantised over the range of all of its elements has few
-//! steps left for the others. Which elements are kept apart depends on their row alone.
+//! Models have a few channels a hundred times as large as the rest. A row that is quantised over the range of all of its
+//! elements has few steps left for the others. Which elements are kept apart depends on their row alone.
 
 use std::mem::MaybeUninit;
 
@@ -11,13 +11,14 @@ use crate::simd::{Kernel, Simd};
 /// The most elements of a row that are kept apart.
 pub(crate) const MAX_OUTLIERS: usize = 8;
 
-/// Elements beyond this many times the mean magnitude of their row are kept apart: normal ones never are, of 6144 products of two normal ones
-/// one or two.
+/// Elements beyond this many times the mean magnitude of their row are kept apart: normal ones never are, of 6144 products
+/// of two normal ones one or two.
 ///
-/// Relative error of the features of a small backbone (8 layers each, widths 288 and 512), all large layers in int8: 0.038, and 0.037 with
-/// 12. With channels of down projections planted 50 and 1000 times as large: 0.09 and 0.50, with 12 0.040 and 0.059; of fc2: 0.09 and 0.78,
-/// with 12 0.068 and 0.11. Thresholds of 6 and 8, and 4 or 16 elements, change these by less than a tenth.
-const FACTOR: f32 = 12.0;
+/// Relative error of the features of a small backbone (8 layers each, widths 288 and 512), all large layers in int8: 0.038,
+/// and 0.037 with 12. With channels of down projections planted 50 and 1000 times as large: 0.09 and 0.50, with 12 0.040 and
+/// 0.059; of fc2: 0.09 and 0.78, with 12 0.068 and 0.11. Thresholds of 6 and 8, and 4 or 16 elements, change these by less
+/// than a tenth.
+const THRESHOLD: f32 = 12.0;
 
 /// What is larger is not kept apart: as many products with 127 must not overflow.
 const LARGEST: f32 = f32::MAX / (128 * MAX_OUTLIERS) as f32;
@@ -42,7 +43,7 @@ impl Outliers {
             inputs: [0; MAX_OUTLIERS],
             values: [0.0; MAX_OUTLIERS],
         };
-        let limit = FACTOR * (sum / row.len() as f32);
+        let limit = THRESHOLD * (sum / row.len() as f32);
         // Not with infinity or NaN; nor where products with bytes could overflow, as those with weights do not.
         let can_be_multiplied = largest < LARGEST;
         if largest <= limit || !can_be_multiplied {
@@ -110,7 +111,7 @@ impl Kernel for MultiplyOutliers<'_> {
         for (outliers, sums) in rows.filter(|(outliers, _)| !outliers.is_empty()) {
             sums.fill(MaybeUninit::new(0.0));
             // SAFETY: they were written.
-            let sums = unsafe { &mut *(std::ptr::from_mut(sums) as *mut [f32]) };
+            let sums = unsafe { sums.assume_init_mut() };
             for (input, value) in outliers.iter() {
                 let (run, word) = (self.run, input / 4);
                 let words = &self.panel[word / run * run * self.columns..][..run * self.columns];

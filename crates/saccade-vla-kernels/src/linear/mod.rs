@@ -1,14 +1,15 @@
 //! The packed linear layer: `out = epilogue(x W^T + bias)` with weights packed once.
 //!
-//! A [`Gemm`] packs the weights in panels of output columns, converts rows where it has to, and makes the sums of a block of rows and a
-//! panel. This module splits the work over blocks and panels, never over the summed dimension, and finishes the sums. So an output's bits
-//! depend on its row, its weights and the instruction set only: neither on the number of rows nor on how the work is split.
+//! A [`Gemm`] packs the weights in panels of output columns, converts rows where it has to, and makes the sums of a block of
+//! rows and a panel. This module splits the work over blocks and panels, never over the summed dimension, and finishes the
+//! sums. So an output's bits depend on its row, its weights and the instruction set only: neither on the number of rows nor
+//! on how the work is split.
 
 mod epilogue;
 mod error;
-mod order;
 mod pack;
 mod rows;
+mod schedule;
 
 use std::mem::MaybeUninit;
 use std::ops::Range;
@@ -16,7 +17,7 @@ use std::ops::Range;
 use crate::aligned::{AlignedBuffer, AllocError, elements};
 use crate::cpu::Cpu;
 use crate::gemm::outliers::{MultiplyOutliers, Outliers};
-use crate::gemm::{Block, Gemm, MAX_COLUMNS, MAX_SUMS, Product, Quantized, Tiles};
+use crate::gemm::{Block, Gemm, MAX_NR, MAX_SUMS, Quantized, RowSplit};
 use crate::isa::Isa;
 use crate::parts::part;
 use crate::pool::{parallel_for, usable};
@@ -26,10 +27,10 @@ pub use epilogue::Epilogue;
 use epilogue::{Finish, Int8};
 pub use error::KernelError;
 use error::MAX_INT8_INPUTS;
-use order::Order;
 use pack::{Panels, pack_panels};
-use rows::Conversion;
 pub use rows::LinearScratch;
+use rows::RowConversion;
+use schedule::Schedule;
 
 /// A linear layer whose weights were packed for one instruction set.
 ///
@@ -56,7 +57,7 @@ pub struct PackedLinear {
     panels: Panels,
     /// One for each column of the panels, zero in the padding.
     bias: AlignedBuffer<f32>,
-    /// Whether memory is asked for them as many streams.
+    /// Whether they are prefetched as many streams.
     streams: bool,
     /// Whether the largest elements of a row are kept out of its quantisation.
     keeps_outliers: bool,
@@ -128,10 +129,10 @@ impl PackedLinear {
         let are_bf16 = parts
             .iter()
             .all(|(weight, _)| matches!(weight, WeightRef::Bf16(_)));
-        let (product, element) = product_of(arithmetic, are_bf16, in_features)?;
-        let gemm = isa.gemm(product);
+        let element = packed_element(arithmetic, are_bf16, in_features)?;
+        let gemm = isa.gemm(arithmetic, element);
         check_panel(in_features)?;
-        let columns = gemm.shape().columns;
+        let columns = gemm.shape().nr;
         let mut bias = AlignedBuffer::zeroed(out_features.next_multiple_of(columns))?;
         let mut column = 0;
         for (weight, part) in parts {
@@ -140,7 +141,7 @@ impl PackedLinear {
             }
             column += weight.shape().0;
         }
-        let panels = pack_panels(threads, &*gemm, product == Product::Int8, parts)?;
+        let panels = pack_panels(threads, &*gemm, element == Element::Int8, parts)?;
         Ok(Self {
             isa,
             gemm,
@@ -155,16 +156,17 @@ impl PackedLinear {
         })
     }
 
-    /// Asks memory for the weights as many streams, or in their order, instead of as was measured to be faster on this family of CPUs. For
-    /// programs that measure it: results have the same bits. Panels whose steps are one cache line (AVX2, narrow portable vectors) are asked
-    /// for in their order either way, and so are those of NEON.
+    /// Overrides the prefetch pattern of this CPU's family: as many streams, or in order. For programs that measure it:
+    /// results have the same bits. Panels whose steps are one cache line (AVX2, narrow portable vectors) are prefetched in
+    /// their order either way, and so are those of NEON.
+    #[cfg(feature = "peak")]
     #[must_use]
     pub fn with_streams(self, streams: bool) -> Self {
         Self { streams, ..self }
     }
 
-    /// The layer, keeping up to 8 elements of a row out of its quantisation if they are far larger than the others: they are multiplied in
-    /// float32 by the same weights. For [`Arithmetic::Int8`]; no other arithmetic needs it.
+    /// The layer, keeping up to 8 elements of a row out of its quantisation if they are far larger than the others: they are
+    /// multiplied in float32 by the same weights. For [`Arithmetic::Int8`]; no other arithmetic needs it.
     ///
     /// Costs a pass over the rows, and for rows that have such elements some percent of the products.
     #[must_use]
@@ -175,8 +177,8 @@ impl PackedLinear {
         }
     }
 
-    /// The bytes that a layer of `(out_features, in_features)` holds when it is packed; `usize::MAX` for more than that. `weights` is [`Element::Bf16`] if all its parts are
-    /// bf16; every other element is packed as [`Element::F32`] is.
+    /// The bytes that a layer of `(out_features, in_features)` holds when it is packed; `usize::MAX` for more than that.
+    /// `weights` is [`Element::Bf16`] if all its parts are bf16; every other element is packed as [`Element::F32`] is.
     ///
     /// # Errors
     /// [`KernelError::TooManyInputs`] as [`Self::pack`].
@@ -189,14 +191,14 @@ impl PackedLinear {
         weights: Element,
         (out_features, in_features): (usize, usize),
     ) -> Result<usize, KernelError> {
-        let (product, _) = product_of(arithmetic, weights == Element::Bf16, in_features)?;
+        let element = packed_element(arithmetic, weights == Element::Bf16, in_features)?;
         if check_panel(in_features).is_err() {
             return Ok(usize::MAX);
         }
-        let gemm = isa.gemm(product);
-        let columns = gemm.shape().columns;
+        let gemm = isa.gemm(arithmetic, element);
+        let columns = gemm.shape().nr;
         // A bias for each column; for int8 also a scale and a sum.
-        let words_of_column = if product == Product::Int8 { 3 } else { 1 };
+        let words_of_column = if element == Element::Int8 { 3 } else { 1 };
         let panel = gemm
             .panel_words(in_features)
             .saturating_add(columns * words_of_column);
@@ -226,6 +228,12 @@ impl PackedLinear {
     #[must_use]
     pub fn arithmetic(&self) -> Arithmetic {
         self.arithmetic
+    }
+
+    /// The name of the kernel that multiplies: the instruction set and the elements, as in `avx512-vnni-int8`.
+    #[must_use]
+    pub fn kernel_name(&self) -> &'static str {
+        self.gemm.name()
     }
 
     /// The instruction set that it was packed for.
@@ -281,75 +289,58 @@ impl PackedLinear {
         } else {
             usable(threads).min(macs / MACS_OF_THREAD)
         };
-        let shape = self.gemm.shape();
-        let columns = shape.columns;
-        let num_panels = self.out_features.div_ceil(columns);
-        let tiles = Tiles::new(rows, shape);
-        // More blocks than the rows need where panels are few, so that no thread waits long for the last task of another: 49 x 128 x 128 has
-        // three panels of 48 columns, which two threads would take in the time of two.
+        let num_panels = self.out_features.div_ceil(self.gemm.shape().nr);
+        let split = RowSplit::new(rows, self.gemm.shape());
+        // More blocks than the rows need where panels are few, so that no thread waits long for the last task of another:
+        // 49 x 128 x 128 has three panels of 48 columns, which two threads would take in the time of two.
         let wanted = (TASKS_PER_THREAD * threads)
             .div_ceil(num_panels)
             .min(macs / (num_panels * MACS_OF_TASK));
-        let most = tiles.count.min(if threads == 1 { 1 } else { wanted.max(1) });
+        let most = split.count.min(if threads == 1 { 1 } else { wanted.max(1) });
         let blocks = rows.div_ceil(self.gemm.row_block(self.in_features)).max(most);
         let mut call = Call {
-            x: x.as_ptr().cast(),
-            x_stride: x.row_stride() as isize,
-            tiles,
+            x: x.bits(),
+            split,
             quantized: &[],
             outliers: &[],
-            out_stride: out.row_stride() as isize,
+            out_stride: out.row_stride(),
             out: out.as_mut_ptr(),
             epilogue,
         };
         if let Some(stride) = self.gemm.converted_stride(self.in_features) {
             let conversion = match (self.element, self.keeps_outliers) {
-                (Element::Int8, true) => Conversion::QuantizedWithoutOutliers,
-                (Element::Int8, false) => Conversion::Quantized,
-                _ => Conversion::Rounded,
+                (Element::Int8, true) => RowConversion::QuantizedWithoutOutliers,
+                (Element::Int8, false) => RowConversion::Quantized,
+                _ => RowConversion::Rounded,
             };
             let converted = scratch.convert(&*self.gemm, stride, conversion, threads, x)?;
-            (call.x, call.x_stride) = (converted.words, stride as isize);
+            call.x = converted.words;
             (call.quantized, call.outliers) = (converted.quantized, converted.outliers);
         }
         let panel_bytes = size_of::<u32>() * self.gemm.panel_words(self.in_features);
-        let order = Order::new(blocks, num_panels, panel_bytes, threads, TASKS_PER_THREAD);
-        parallel_for(threads, order.tasks(), &|task| {
-            let (block, panel) = order.at(task);
-            let range = part(tiles.count, block, blocks);
-            self.run_panel(&call, range, columns, panel, order.ahead(task));
+        let schedule = Schedule::new(blocks, num_panels, panel_bytes, threads, TASKS_PER_THREAD);
+        parallel_for(threads, schedule.tasks(), &|task| {
+            let (block, panel) = schedule.at(task);
+            let calls = part(split.count, block, blocks);
+            self.run_panel(&call, calls, panel, schedule.ahead(task));
         });
         Ok(())
     }
 
-    /// Runs the tiles in `range` through panel number `panel`; this thread will probably take the one `ahead` of it next.
-    fn run_panel(&self, call: &Call<'_>, range: Range<usize>, columns: usize, panel: usize, ahead: usize) {
+    /// Runs a block of rows, by `calls` of the micro-kernel, through panel number `panel`; this thread will probably take the
+    /// one `ahead` of it next.
+    fn run_panel(&self, call: &Call<'_>, calls: Range<usize>, panel: usize, ahead: usize) {
         #[repr(align(64))]
         struct SumBuffer([MaybeUninit<u32>; MAX_SUMS]);
 
-        let size = self.gemm.panel_words(self.in_features);
-        let first = panel * columns;
-        let rows = call.tiles.first_row(range.start)..call.tiles.first_row(range.end);
-        assert!(
-            rows.len() <= MAX_SUMS / columns,
-            "a block of {} rows and {columns} columns",
-            rows.len()
-        );
-        let mut sums = SumBuffer([const { MaybeUninit::uninit() }; MAX_SUMS]);
-        let sums = sums.0.as_mut_ptr().cast::<u32>();
-        let out = call.out.wrapping_add(first);
+        let (size, columns) = (self.gemm.panel_words(self.in_features), self.gemm.shape().nr);
+        let first_row = call.split.rows(&calls).start;
         let weights = &self.panels.words[panel * size..][..size];
-        let finish = |done: Range<usize>| {
-            let sums = sums.wrapping_add((done.start - rows.start) * columns);
-            // SAFETY: the product calls this with rows of the block whose needed sums are complete.
-            unsafe { self.finish(call, done, panel, weights, sums) };
-        };
         let block = Block {
             x: call.x,
-            x_stride: call.x_stride,
             in_features: self.in_features,
-            tiles: call.tiles,
-            range,
+            split: call.split,
+            calls,
             weights,
             // The results are made in whole vectors.
             needed: self
@@ -358,34 +349,32 @@ impl PackedLinear {
                 .min(columns),
             ahead,
             streams: self.streams,
-            sums,
-            out,
+            out: call.out.wrapping_add(panel * columns),
             out_stride: call.out_stride,
-            finish: &finish,
         };
-        // SAFETY: the product has packed the panel and, where it does so, converted the rows; the block's sums fit.
-        unsafe { self.gemm.multiply(&block) };
+        let mut sums = SumBuffer([const { MaybeUninit::uninit() }; MAX_SUMS]);
+        self.gemm.multiply_and_finish(&block, &mut sums.0, &|rows, sums| {
+            let sums = &sums[(rows.start - first_row) * columns..];
+            self.finish(call, rows, panel, weights, sums);
+        });
     }
 
     /// Columns of panel number `panel` that the layer has.
     fn panel_width(&self, panel: usize) -> usize {
-        let columns = self.gemm.shape().columns;
+        let columns = self.gemm.shape().nr;
         columns.min(self.out_features - panel * columns)
     }
 
-    /// Makes results of the sums of some rows and panel number `panel`, whose words are `weights`.
-    ///
-    /// # Safety
-    /// `sums` points to the sums of these rows, which are in the call; those of [`Block::needed`] columns are complete.
-    unsafe fn finish(
+    /// Makes results of the complete sums of some rows and panel number `panel`, whose words are `weights`.
+    fn finish(
         &self,
         call: &Call<'_>,
         rows: Range<usize>,
         panel: usize,
         weights: &[u32],
-        sums: *const u32,
+        sums: &[MaybeUninit<u32>],
     ) {
-        let columns = self.gemm.shape().columns;
+        let columns = self.gemm.shape().nr;
         let first = panel * columns;
         let outliers = call.outliers.get(rows.clone()).unwrap_or_default();
         let has_outliers = outliers.iter().any(|outliers| !outliers.is_empty());
@@ -402,7 +391,7 @@ impl PackedLinear {
         let columns_of = first..first + columns;
         self.isa.run(&Finish {
             epilogue: call.epilogue,
-            sums,
+            sums: sums.as_ptr().cast(),
             columns,
             rows,
             width: self.panel_width(panel),
@@ -415,49 +404,50 @@ impl PackedLinear {
                 apart: has_outliers.then_some(&apart[..]),
             },
             out: call.out.wrapping_add(first),
-            out_stride: call.out_stride,
+            out_stride: call.out_stride as isize,
         });
     }
 }
 
-/// Checks that memory can have a panel, and a converted row, of `in_features`: every [`Gemm`] multiplies and pads their sizes without checks.
+/// Checks that memory can have a panel, and a converted row, of `in_features`: every [`Gemm`] multiplies and pads their sizes
+/// without checks.
 fn check_panel(in_features: usize) -> Result<(), AllocError> {
     // More than any product pads a row to.
     let padded = in_features.checked_next_multiple_of(1024);
     let padded = padded.ok_or(AllocError { bytes: usize::MAX })?;
-    elements(padded, MAX_COLUMNS * size_of::<u32>()).map(drop)
+    elements(padded, MAX_NR * size_of::<u32>()).map(drop)
 }
 
-/// What multiplies weights, which `are_bf16` or are not, and the elements that they are packed as.
-fn product_of(
+/// The element that weights, which `are_bf16` or are not, are packed as.
+fn packed_element(
     arithmetic: Arithmetic,
     are_bf16: bool,
     in_features: usize,
-) -> Result<(Product, Element), KernelError> {
+) -> Result<Element, KernelError> {
     match arithmetic {
-        Arithmetic::Float32 if are_bf16 => Ok((Product::WidenedBf16, Element::Bf16)),
-        Arithmetic::Float32 => Ok((Product::Float32, Element::F32)),
-        Arithmetic::Bfloat16 => Ok((Product::Bf16, Element::Bf16)),
+        Arithmetic::Float32 if are_bf16 => Ok(Element::Bf16),
+        Arithmetic::Float32 => Ok(Element::F32),
+        Arithmetic::Bfloat16 => Ok(Element::Bf16),
         Arithmetic::Int8 if in_features > MAX_INT8_INPUTS => {
             Err(KernelError::TooManyInputs { given: in_features })
         }
-        Arithmetic::Int8 => Ok((Product::Int8, Element::Int8)),
+        Arithmetic::Int8 => Ok(Element::Int8),
     }
 }
 
-/// The activations and results of one call, as raw parts that tasks write to at the same time.
+/// The activations and results of one call.
 struct Call<'a> {
     /// As [`Block::x`].
-    x: *const u32,
-    x_stride: isize,
-    tiles: Tiles,
+    x: Rows<'a, u32>,
+    split: RowSplit,
     quantized: &'a [Quantized],
     /// Of each row, if they are kept apart.
     outliers: &'a [Outliers],
+    /// Row 0 of the results, to which tasks write at the same time.
     out: *mut f32,
-    out_stride: isize,
+    out_stride: usize,
     epilogue: Epilogue,
 }
 
-// SAFETY: tasks read `x` and write disjoint parts of `out`: no two have a block of rows and a panel in common.
+// SAFETY: tasks write disjoint parts of `out`, borrowed for the whole call: no two have a block of rows and a panel in common.
 unsafe impl Sync for Call<'_> {}

@@ -4,6 +4,7 @@ use super::error::KernelError;
 use crate::aligned::{AlignedBuffer, elements};
 use crate::gemm::{Gemm, PanelMut};
 use crate::pool::{Interrupted, is_stopped, parallel_for};
+use crate::rows::{RowsMut, SharedRows};
 use crate::weights::WeightRef;
 
 /// Packed weights.
@@ -23,7 +24,7 @@ pub(super) fn pack_panels(
     is_int8: bool,
     parts: &[(WeightRef<'_>, Option<&[f32]>)],
 ) -> Result<Panels, KernelError> {
-    let columns = gemm.shape().columns;
+    let columns = gemm.shape().nr;
     let in_features = parts[0].0.shape().1;
     let out_features: usize = parts.iter().map(|(weight, _)| weight.shape().0).sum();
     let num_panels = out_features.div_ceil(columns);
@@ -32,27 +33,29 @@ pub(super) fn pack_panels(
     let mut words = AlignedBuffer::zeroed(elements(num_panels, size)?)?;
     let mut scales = AlignedBuffer::zeroed(num_panels * int8)?;
     let mut sums = AlignedBuffer::zeroed(num_panels * int8)?;
-    let to = To {
-        words: words.pointer(),
-        scales: scales.as_mut_ptr(),
-        sums: sums.as_mut_ptr(),
-    };
+    let to_words = SharedRows::new(RowsMut::strided(&mut words, num_panels, size, size));
+    let to_scales = SharedRows::new(RowsMut::strided(&mut scales, num_panels, int8, int8));
+    let to_sums = SharedRows::new(RowsMut::strided(&mut sums, num_panels, int8, int8));
     parallel_for(threads, num_panels, &|index| {
-        let to = &to;
+        let panel = index..index + 1;
+        // SAFETY: tasks have different panels.
+        let (mut words, mut scales, mut sums) = unsafe {
+            (
+                to_words.block(panel.clone(), 0..size),
+                to_scales.block(panel.clone(), 0..int8),
+                to_sums.block(panel, 0..int8),
+            )
+        };
         let (first, end) = (index * columns, (index + 1) * columns);
         let mut part_first = 0;
         for (weight, _) in parts {
             let part_end = part_first + weight.shape().0;
             let (from, until) = (part_first.max(first), part_end.min(end));
             if from < until {
-                // SAFETY: the buffers hold `num_panels` panels, and each task has its own; that of the part before is
-                // not used any more.
-                let panel = unsafe {
-                    PanelMut {
-                        words: std::slice::from_raw_parts_mut(to.words.add(index * size), size),
-                        scales: std::slice::from_raw_parts_mut(to.scales.add(index * int8), int8),
-                        sums: std::slice::from_raw_parts_mut(to.sums.add(index * int8), int8),
-                    }
+                let panel = PanelMut {
+                    words: words.row_mut(0),
+                    scales: scales.row_mut(0),
+                    sums: sums.row_mut(0),
                 };
                 let rows = weight.rows(from - part_first..until - part_first);
                 gemm.pack(rows, from - first, panel);
@@ -65,12 +68,3 @@ pub(super) fn pack_panels(
     }
     Ok(Panels { words, scales, sums })
 }
-
-struct To {
-    words: *mut u32,
-    scales: *mut f32,
-    sums: *mut i32,
-}
-
-// SAFETY: tasks write different panels.
-unsafe impl Sync for To {}

@@ -2,10 +2,10 @@
 
 use crate::aligned::{AlignedBuffer, AllocError, elements};
 use crate::gemm::outliers::Outliers;
-use crate::gemm::{Gemm, Quantized, Source};
-use crate::parts::part_start;
+use crate::gemm::{Conversion, Gemm, Quantized};
+use crate::parts::{part, threads_and_tasks};
 use crate::pool::parallel_for;
-use crate::rows::Rows;
+use crate::rows::{Rows, RowsMut, SharedRows};
 
 /// Memory for activations on their way through [`PackedLinear::apply`](super::PackedLinear::apply): one for all layers that are called one
 /// after the other. It grows to what the largest of them needs.
@@ -17,7 +17,8 @@ pub struct LinearScratch {
 
 /// Rows in the scratch.
 pub(super) struct Converted<'a> {
-    pub words: *const u32,
+    /// In whole groups.
+    pub words: Rows<'a, u32>,
     /// Of each row, for int8.
     pub quantized: &'a [Quantized],
     /// Of each row, if they were kept apart; otherwise empty.
@@ -26,17 +27,11 @@ pub(super) struct Converted<'a> {
 
 /// Whether rows are quantised, and what is kept apart then.
 #[derive(Clone, Copy, PartialEq, Eq)]
-pub(super) enum Conversion {
+pub(super) enum RowConversion {
     Rounded,
     Quantized,
     QuantizedWithoutOutliers,
 }
-
-/// Elements from which a second thread pays.
-const ELEMENTS_FOR_THREADS: usize = 1 << 16;
-
-/// Elements of one task.
-const ELEMENTS_PER_TASK: usize = 1 << 13;
 
 impl LinearScratch {
     /// Empty: memory is claimed by the first call that needs it.
@@ -62,53 +57,50 @@ impl LinearScratch {
         &mut self,
         gemm: &dyn Gemm,
         stride: usize,
-        conversion: Conversion,
+        conversion: RowConversion,
         threads: usize,
         x: Rows<'_>,
     ) -> Result<Converted<'_>, AllocError> {
         let (rows, width, shape) = (x.num_rows(), x.num_columns(), gemm.shape());
         let groups = rows.div_ceil(shape.row_group);
-        let held = groups * shape.row_group + shape.rows_beyond;
+        let held = groups * shape.row_group;
         let words = elements(held, stride)?;
         if self.words.len() < words {
             self.words = AlignedBuffer::zeroed(words)?;
         }
-        if conversion != Conversion::Rounded && self.quantized.len() < rows {
+        let is_quantized = conversion != RowConversion::Rounded;
+        if is_quantized && self.quantized.len() < rows {
             self.quantized = AlignedBuffer::zeroed(rows)?;
         }
-        let keeps_outliers = conversion == Conversion::QuantizedWithoutOutliers;
+        let keeps_outliers = conversion == RowConversion::QuantizedWithoutOutliers;
         if keeps_outliers && self.outliers.len() < rows {
             self.outliers = AlignedBuffer::zeroed(rows)?;
         }
-        let elements_given = rows.saturating_mul(width);
-        let tasks = elements_given.div_ceil(ELEMENTS_PER_TASK).clamp(1, groups.max(1));
-        let threads = if elements_given < ELEMENTS_FOR_THREADS {
-            1
-        } else {
-            threads
-        };
-        let source = SharedSource(Source {
-            x: x.as_ptr(),
-            x_stride: x.row_stride() as isize,
-            in_features: width,
-            words: self.words.as_mut_ptr(),
-            quantized: self.quantized.as_mut_ptr(),
-            outliers: keeps_outliers.then(|| self.outliers.as_mut_ptr()),
-        });
+        let group_words = shape.row_group * stride;
+        let to_words = SharedRows::new(RowsMut::new(&mut self.words[..words], group_words));
+        let kept = |is_kept| if is_kept { rows } else { 0 };
+        let to_quantized = SharedRows::new(RowsMut::new(&mut self.quantized[..kept(is_quantized)], 1));
+        let to_outliers = SharedRows::new(RowsMut::new(&mut self.outliers[..kept(keeps_outliers)], 1));
+        let (threads, tasks) = threads_and_tasks(threads, rows, width, groups);
+        let tasks = tasks.max(1);
         parallel_for(threads, tasks, &|task| {
-            let source = &source;
-            let first = |task| rows.min(part_start(groups, task, tasks) * shape.row_group);
-            // SAFETY: tasks have different groups of rows, for which there is room.
-            unsafe { gemm.convert(&source.0, first(task)..first(task + 1)) };
+            let groups = part(groups, task, tasks);
+            let given = (groups.start * shape.row_group).min(rows)..(groups.end * shape.row_group).min(rows);
+            // SAFETY: tasks have different groups of rows.
+            let conversion = unsafe {
+                Conversion {
+                    x: x.rows(given.clone()),
+                    words: to_words.block(groups, 0..group_words),
+                    quantized: is_quantized.then(|| to_quantized.block(given.clone(), 0..1)),
+                    outliers: keeps_outliers.then(|| to_outliers.block(given, 0..1)),
+                }
+            };
+            gemm.convert(conversion);
         });
         Ok(Converted {
-            words: self.words.as_ptr(),
+            words: Rows::strided(&self.words, held, stride, stride),
             quantized: &self.quantized,
-            outliers: if keeps_outliers {
-                &self.outliers[..rows]
-            } else {
-                &[]
-            },
+            outliers: &self.outliers[..kept(keeps_outliers)],
         })
     }
 }
@@ -118,8 +110,3 @@ impl Default for LinearScratch {
         Self::new()
     }
 }
-
-struct SharedSource(Source);
-
-// SAFETY: tasks read `x` and write different rows of the scratch, both borrowed for the whole call.
-unsafe impl Sync for SharedSource {}

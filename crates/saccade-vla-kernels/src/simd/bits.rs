@@ -66,3 +66,21 @@ pub(crate) fn write<T: Bits, V: Bits>(vector: V, to: &mut [T]) {
     // SAFETY: the slice has the size of the vector, and any bits are elements of it. It may begin anywhere.
     unsafe { to.as_mut_ptr().cast::<V>().write_unaligned(vector) }
 }
+
+/// The same memory as elements of another type, of which a whole number fits into each.
+#[inline(always)]
+pub(crate) fn cast_slice<From: Bits, To: Bits>(from: &[From]) -> &[To] {
+    const { assert!(size_of::<From>().is_multiple_of(size_of::<To>()) && align_of::<To>() <= align_of::<From>()) }
+    let len = from.len() * (size_of::<From>() / size_of::<To>());
+    // SAFETY: the memory has this size and alignment, and any bits are a `To`.
+    unsafe { std::slice::from_raw_parts(from.as_ptr().cast(), len) }
+}
+
+/// The same of memory to write.
+#[inline(always)]
+pub(crate) fn cast_slice_mut<From: Bits, To: Bits>(from: &mut [From]) -> &mut [To] {
+    const { assert!(size_of::<From>().is_multiple_of(size_of::<To>()) && align_of::<To>() <= align_of::<From>()) }
+    let len = from.len() * (size_of::<From>() / size_of::<To>());
+    // SAFETY: the memory has this size and alignment, and any bits are a `To` and a `From`.
+    unsafe { std::slice::from_raw_parts_mut(from.as_mut_ptr().cast(), len) }
+}

@@ -29,6 +29,8 @@ pub(crate) const MAX_TILE_ROWS: usize = 8;
 ///
 /// Slices are loaded and stored from their first element on; they need not be aligned.
 pub(crate) trait Simd: Copy + Send + Sync + 'static {
+    /// The part of kernels' names that says which vectors they use.
+    const NAME: &'static str;
     /// Elements of a vector, at most [`MAX_LANES`].
     const LANES: usize;
     /// Rows of the largest register tile (MR), at most [`MAX_TILE_ROWS`]. A tile is
@@ -364,19 +366,10 @@ use {forward, functions, token};
 pub(crate) trait Kernel {
     type Output;
 
-    /// The dot products that the kernel uses, if there are instructions for them.
-    const DOTS: Option<Dot> = None;
+    /// Whether the kernel uses dot products of bfloat16, if there is an instruction for them.
+    const USES_DOT_BF16: bool = false;
 
     fn run<S: Simd>(self, simd: S) -> Self::Output;
-}
-
-/// Products of narrow elements that some instruction sets have instructions for.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum Dot {
-    /// Pairs of bfloat16.
-    Bf16,
-    /// Quads of int8.
-    Int8,
 }
 
 #[cfg(test)]

@@ -37,6 +37,7 @@ fn power_of_two(exponent: f32) -> f32 {
 }
 
 impl<const N: usize> Simd for Loops<N> {
+    const NAME: &'static str = "portable";
     const LANES: usize = N;
     const TILE_ROWS: usize = 4;
     // Sixteen lanes are laid out as those of AVX-512 are.

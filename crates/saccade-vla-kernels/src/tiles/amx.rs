@@ -4,7 +4,7 @@
 
 use std::mem::offset_of;
 
-use super::{Config, Job, MAX_COLUMN_TILES, Operation, Shape, TILE, TileUnit};
+use super::{Config, Job, MAX_COLUMN_TILES, Operation, Shape, TileUnit};
 use crate::cpu::tiles::permission;
 use crate::simd::Simd;
 use crate::simd::x86_64::avx512::Avx512Amx;
@@ -25,8 +25,8 @@ macro_rules! tiles {
     };
 }
 
-/// A few cache lines after a product: the CPU's own prefetching follows each of their streams. All at once they would stall it.
-macro_rules! ask_ahead {
+/// Prefetches a few cache lines after a product: the CPU's own prefetching follows each of their streams. All at once they would stall it.
+macro_rules! prefetch_ahead {
     () => {
         concat!(
             "mov {i}, [{job} + {lines}]\n",
@@ -52,7 +52,7 @@ macro_rules! product {
             " tmm",
             $sum,
             ", tmm6, tmm7\n",
-            ask_ahead!()
+            prefetch_ahead!()
         )
     };
 }
@@ -66,7 +66,7 @@ macro_rules! products_apart {
                 "tileloadd tmm7, [{c} + {w_stride}*1]\n",
                 $operation, " tmm", $sum, ", tmm6, tmm7\n",
                 "add {c}, [{job} + {w_column}]\n",
-                ask_ahead!(), "\n"
+                prefetch_ahead!(), "\n"
             ),+
         )
     };
@@ -97,7 +97,7 @@ macro_rules! kernel {
         /// # Safety
         /// AMX is permitted and its tiles have the sizes of the job, whose pointers are valid for them.
         unsafe fn $name(job: &Job) {
-            // SAFETY: the caller's promise; prefetching is allowed at any address.
+            // SAFETY: the contract of this function; prefetching is allowed at any address.
             unsafe {
                 tiles!(
                     "cmp qword ptr [{job} + {add}], 0",
@@ -165,13 +165,13 @@ macro_rules! products_of_two {
             " tmm",
             $first,
             ", tmm6, tmm7\n",
-            ask_ahead!(),
+            prefetch_ahead!(),
             "\n",
             $operation,
             " tmm",
             $second,
             ", tmm5, tmm7\n",
-            ask_ahead!(),
+            prefetch_ahead!(),
             "\n",
             "add {c}, [{job} + {w_column}]"
         )
@@ -256,12 +256,13 @@ const BF16_ROWS: [unsafe fn(&Job); MAX_COLUMN_TILES] =
 const BF16_TWO_ROWS: [unsafe fn(&Job); 2] = [bf16_two1, bf16_two2];
 
 /// Independent products, from tiles that stay what they are: of zeros, whose speed is that of any numbers.
-macro_rules! chains {
+#[cfg(feature = "peak")]
+macro_rules! peak_loop {
     ($name:ident, $operation:literal) => {
         /// # Safety
         /// AMX is permitted and its tiles have sizes.
         unsafe fn $name(iterations: usize) {
-            // SAFETY: the caller's promise; no memory is involved.
+            // SAFETY: the contract of this function; no memory is involved.
             unsafe {
                 tiles!(
                     each_sum!(zero: "0", "1", "2", "3", "4", "5", "6", "7"),
@@ -281,13 +282,16 @@ macro_rules! chains {
     };
 }
 
-chains!(bf16_chains, "tdpbf16ps");
-chains!(int8_chains, "tdpbusd");
+#[cfg(feature = "peak")]
+peak_loop!(bf16_peak, "tdpbf16ps");
+#[cfg(feature = "peak")]
+peak_loop!(int8_peak, "tdpbusd");
 
 // SAFETY: a value exists only where the vectors do and AMX is permitted; the kernels keep to the job.
 unsafe impl TileUnit for Amx {
     type Simd = Avx512Amx;
     type Registers = ();
+    const NAME: &'static str = "amx";
 
     #[inline]
     fn new() -> Option<Self> {
@@ -311,7 +315,7 @@ unsafe impl TileUnit for Amx {
 
     #[inline]
     unsafe fn release(self, (): &mut ()) {
-        // SAFETY: as above.
+        // SAFETY: there is a unit, so AMX is permitted.
         unsafe { tiles!("tilerelease") }
     }
 
@@ -325,127 +329,22 @@ unsafe impl TileUnit for Amx {
             (Operation::Int8, Shape::Block) => int8_block,
             (Operation::Int8, shape) => unreachable!("a product of int8 in {shape:?}"),
         };
-        // SAFETY: the caller's promise.
+        // SAFETY: the contract of the trait is that of the kernels.
         unsafe { kernel(job) }
     }
 
-    fn chains(self, operation: Operation) -> usize {
+    #[cfg(feature = "peak")]
+    fn multiply_for_peak(self, operation: Operation) -> usize {
         const ITERATIONS: usize = 1 << 17;
         // SAFETY: there is a unit; the tiles have sizes until they are released.
         unsafe {
-            self.configure(&mut (), &Config::of_rows(TILE));
+            self.configure(&mut (), &Config::of_rows(super::TILE));
             match operation {
-                Operation::Bf16 => bf16_chains(ITERATIONS),
-                Operation::Int8 => int8_chains(ITERATIONS),
+                Operation::Bf16 => bf16_peak(ITERATIONS),
+                Operation::Int8 => int8_peak(ITERATIONS),
             }
             self.release(&mut ());
         }
-        ITERATIONS * 6 * TILE * TILE * TILE * operation.per_word()
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use std::io::Write;
-
-    use super::super::software::tests::{layouts, pairs, product, words};
-    use super::super::{MAX_ROWS, Product, Session, Software};
-    use super::*;
-
-    /// What both units make of a product with these operands.
-    fn both(operation: Operation, rows: usize, steps: usize, x: &[u32], w: &[u32], before: &[u32]) {
-        let amx = Amx::new().expect("looked at before");
-        let of = |columns: usize, apart: bool, add: bool| {
-            let [mut hard, mut soft] = [before.to_vec(), before.to_vec()];
-            let with = |sums| {
-                let product = Product {
-                    columns,
-                    add,
-                    sums_stride: MAX_COLUMN_TILES * TILE,
-                    ..product(operation, x, w, sums)
-                };
-                if !apart {
-                    return product;
-                }
-                Product {
-                    w_stride: TILE,
-                    w_step: TILE * TILE,
-                    // Columns overlap, so that all of them fit.
-                    w_column: (w.len() - steps * TILE * TILE) / (MAX_COLUMN_TILES - 1),
-                    ..product
-                }
-            };
-            // SAFETY: the operands have these sizes.
-            unsafe {
-                Session::new(amx).multiply(&with(&mut hard));
-                Session::new(Software).multiply(&with(&mut soft));
-            }
-            let is_nan = |bits: u32| operation == Operation::Bf16 && f32::from_bits(bits).is_nan();
-            for (index, (&hard, &soft)) in hard.iter().zip(&soft).enumerate() {
-                let same = hard == soft || (is_nan(hard) && is_nan(soft));
-                let what =
-                    format!("{operation:?}, {rows} rows, {steps} steps, {columns} columns, number {index}");
-                assert!(same, "{what}: {hard:#x} in hardware, {soft:#x} in software");
-            }
-        };
-        for add in [false, true] {
-            layouts(operation, rows).for_each(|(columns, apart)| of(columns, apart, add));
-        }
-    }
-
-    #[test]
-    fn hardware_and_software_tiles_agree_bit_for_bit() {
-        if let Err(refusal) = permission() {
-            // Past the test runner, which keeps back what a test prints.
-            let _ = writeln!(
-                std::io::stderr(),
-                "SKIPPED: the tiles of AMX are not compared with software: {refusal}"
-            );
-            return;
-        }
-        for rows in 1..=MAX_ROWS {
-            let steps = 1 + rows % 4;
-            let (x_size, w_size, sums) = (
-                rows * TILE * steps,
-                3 * TILE * TILE * steps,
-                rows * MAX_COLUMN_TILES * TILE,
-            );
-            for seed in 0..8 {
-                let (x, w, before) = (
-                    words(seed, x_size),
-                    words(seed + 50, w_size),
-                    words(seed + 90, sums),
-                );
-                both(Operation::Int8, rows, steps, &x, &w, &before);
-                // Any bits; exponents far apart; denormals.
-                both(Operation::Bf16, rows, steps, &x, &w, &before);
-                for (keep, set) in [(0x83ff_83ff, 0x3000_3000), (0x81ff_81ff, 0)] {
-                    let masked =
-                        |words: &[u32]| words.iter().map(|word| word & keep | set).collect::<Vec<_>>();
-                    both(
-                        Operation::Bf16,
-                        rows,
-                        steps,
-                        &masked(&x),
-                        &masked(&w),
-                        &masked(&before),
-                    );
-                }
-                let numbers = [pairs(seed, x_size), pairs(seed + 50, w_size)];
-                let before: Vec<_> = before
-                    .iter()
-                    .map(|word| (*word as f32 * 1e-9).to_bits())
-                    .collect();
-                both(Operation::Bf16, rows, steps, &numbers[0], &numbers[1], &before);
-            }
-        }
-    }
-
-    #[test]
-    fn peaks_of_tiles_are_counted() {
-        if let Some(amx) = Amx::new() {
-            let [bf16, int8] = [Operation::Bf16, Operation::Int8].map(|operation| amx.chains(operation));
-            assert_eq!(int8, 2 * bf16);
-        }
+        ITERATIONS * 6 * super::TILE.pow(3) * operation.per_word()
     }
 }

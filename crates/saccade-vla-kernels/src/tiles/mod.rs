@@ -4,11 +4,15 @@
 
 #[cfg(target_arch = "x86_64")]
 pub(crate) mod amx;
+#[cfg(feature = "software-tiles")]
 mod software;
+#[cfg(test)]
+mod tests;
 
 use std::mem::size_of;
 
 use crate::simd::Simd;
+#[cfg(feature = "software-tiles")]
 pub(crate) use software::Software;
 
 /// Rows of a tile, and words in a row of it.
@@ -39,7 +43,7 @@ impl Operation {
     }
 }
 
-/// What a product asks memory for: after each product of tiles `lines` cache lines, `pitch` bytes apart, from `at` on in the first step and
+/// What a product prefetches: after each product of tiles `lines` cache lines, `pitch` bytes apart, from `at` on in the first step and
 /// from `advance` bytes further on in each later one. Any address will do.
 #[derive(Clone, Copy)]
 pub(crate) struct Ahead {
@@ -134,6 +138,7 @@ pub(crate) struct Config {
 const _: () = assert!(size_of::<Config>() == 64);
 
 /// The tile of rows, and that of weights.
+#[cfg(any(test, feature = "software-tiles"))]
 const X: usize = 6;
 const W: usize = 7;
 
@@ -170,6 +175,9 @@ pub(crate) unsafe trait TileUnit: Copy + Send + Sync + 'static {
     /// Where tiles are, if not in the CPU.
     type Registers;
 
+    /// Its part of a kernel's name.
+    const NAME: &'static str;
+
     /// The proof that it may be used.
     fn new() -> Option<Self>;
 
@@ -197,8 +205,9 @@ pub(crate) unsafe trait TileUnit: Copy + Send + Sync + 'static {
     /// The tiles have their sizes; all pointers of `job` are valid for as many rows, for its steps and for the columns of `shape`.
     unsafe fn run(self, registers: &mut Self::Registers, operation: Operation, shape: Shape, job: &Job);
 
-    /// Runs products from registers for some milliseconds; returns how many multiply-accumulates that were.
-    fn chains(self, operation: Operation) -> usize;
+    /// Multiplies tiles in registers for some milliseconds; returns how many multiply-accumulates that were.
+    #[cfg(feature = "peak")]
+    fn multiply_for_peak(self, operation: Operation) -> usize;
 }
 
 /// Work that is written once for all units.
@@ -272,7 +281,7 @@ impl<U: TileUnit> Session<U> {
             ahead_advance: product.ahead.advance,
             ahead_lines: product.ahead.lines,
         };
-        // SAFETY: the caller's promise; the tiles have the sizes of this job from here on.
+        // SAFETY: the pointers are valid for the product; the tiles have the sizes of this job from here on.
         unsafe {
             if self.rows != tile_rows {
                 self.unit

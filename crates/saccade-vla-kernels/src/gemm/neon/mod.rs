@@ -1,10 +1,7 @@
-//! Products on NEON, whose instructions take an element of a row by lane, or multiply two rows by two columns.
+//! The micro-kernel of NEON, whose instructions take an element of a row by lane, or multiply two rows by two columns.
 
-pub(crate) mod bf16;
-mod by_lane;
-mod chains;
-pub(crate) mod float32;
-pub(crate) mod int8;
-mod pairs;
-mod quantizing;
-mod tile;
+mod micro_kernel;
+mod steps;
+
+pub(crate) use micro_kernel::Lanes;
+pub(crate) use steps::{DotprodInt8, I8mmInt8, MatrixBf16, WideningInt8};

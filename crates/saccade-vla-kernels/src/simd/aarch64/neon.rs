@@ -22,6 +22,7 @@ macro_rules! neon {
         token! {
             $(#[$doc])*
             $name: is_aarch64_feature_detected["neon" $(, $feature)*], {
+                const NAME: &'static str = "neon";
                 const LANES: usize = 4;
                 // The tile of attention alone: 20 sums, five factors by lane, four columns and what widens
                 // them. Four vectors divide the usual widths of heads.

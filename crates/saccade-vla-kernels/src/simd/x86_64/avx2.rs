@@ -12,6 +12,7 @@ macro_rules! avx2 {
         token! {
             $(#[$doc])*
             $name: is_x86_feature_detected["avx2", "fma" $(, $feature)*], {
+                const NAME: &'static str = "avx2";
                 const LANES: usize = 8;
                 const TILE_ROWS: usize = 6;
                 const TILE_VECTORS: usize = 2;

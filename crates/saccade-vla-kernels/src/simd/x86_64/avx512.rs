@@ -16,6 +16,7 @@ macro_rules! avx512 {
             $name: is_x86_feature_detected[
                 "avx512f", "avx512vl", "avx512bw", "avx512dq", "avx2", "fma" $(, $feature)*
             ] $(if $condition)?, {
+                const NAME: &'static str = "avx512";
                 const LANES: usize = 16;
                 const TILE_ROWS: usize = 8;
                 const TILE_VECTORS: usize = 3;

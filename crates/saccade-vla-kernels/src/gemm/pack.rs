@@ -1,11 +1,25 @@
-//! Panels that are words of consecutive `k` of one column: `[k / STEP][column]`, the first `k` lowest, zeros where there are no more.
+//! Panels that are words of consecutive `k` of one column: `[k / PER_WORD][column]`, the first `k` lowest, zeros where there
+//! are no more. Of elements with groups, as many words of a column are next to each other.
 
 use super::PanelMut;
+use super::elements::Elements;
 use crate::matrix::Matrix;
-use crate::weights::{WeightRef, quantize, row_scale};
+use crate::weights::{Element, WeightRef, quantize, row_scale};
 
-/// Writes float32 columns from `first` on, one for each row of `weight`.
-pub(super) fn pack_f32(weight: WeightRef<'_>, first: usize, columns: usize, words: &mut [u32]) {
+/// Writes the columns of a panel from `first` on, one for each row of `weight`.
+pub(super) fn pack<E: Elements>(weight: WeightRef<'_>, first: usize, columns: usize, panel: PanelMut<'_>) {
+    const { assert!(E::GROUP <= 2) }
+    match (E::WEIGHTS, E::GROUP) {
+        (Element::F32, _) => put_f32(weight, first, columns, panel.words),
+        (Element::Bf16, 1) => put_bf16::<1>(weight, first, columns, panel.words),
+        (Element::Bf16, _) => put_bf16::<2>(weight, first, columns, panel.words),
+        (Element::Int8, 1) => put_int8::<1>(weight, first, columns, panel),
+        (Element::Int8, _) => put_int8::<2>(weight, first, columns, panel),
+    }
+}
+
+/// float32.
+fn put_f32(weight: WeightRef<'_>, first: usize, columns: usize, words: &mut [u32]) {
     match weight {
         WeightRef::F32(view) => put::<_, 1, 1>(words, columns, first, view, |_, value| value.to_bits()),
         WeightRef::Bf16(view) => put::<_, 1, 1>(words, columns, first, view, |_, value| {
@@ -17,28 +31,7 @@ pub(super) fn pack_f32(weight: WeightRef<'_>, first: usize, columns: usize, word
     }
 }
 
-/// The same in pairs of bfloat16.
-pub(super) fn pack_bf16(weight: WeightRef<'_>, first: usize, columns: usize, words: &mut [u32]) {
-    put_bf16::<1>(weight, first, columns, words);
-}
-
-/// Two words of a column next to each other: `[k / 4][column][2]`.
-#[cfg(target_arch = "aarch64")]
-pub(super) fn pack_bf16_in_fours(weight: WeightRef<'_>, first: usize, columns: usize, words: &mut [u32]) {
-    put_bf16::<2>(weight, first, columns, words);
-}
-
-/// The same in quads of int8, with the scales of the columns and the sums of their weights.
-pub(super) fn pack_int8(weight: WeightRef<'_>, first: usize, columns: usize, panel: PanelMut<'_>) {
-    put_int8::<1>(weight, first, columns, panel);
-}
-
-/// Two words of a column next to each other: `[k / 8][column][2]`.
-#[cfg(target_arch = "aarch64")]
-pub(super) fn pack_int8_in_eights(weight: WeightRef<'_>, first: usize, columns: usize, panel: PanelMut<'_>) {
-    put_int8::<2>(weight, first, columns, panel);
-}
-
+/// Pairs of bfloat16.
 fn put_bf16<const RUN: usize>(weight: WeightRef<'_>, first: usize, columns: usize, words: &mut [u32]) {
     match weight {
         WeightRef::Bf16(view) => {
@@ -53,6 +46,7 @@ fn put_bf16<const RUN: usize>(weight: WeightRef<'_>, first: usize, columns: usiz
     }
 }
 
+/// Quads of int8, with the scales of the columns and the sums of their weights.
 fn put_int8<const RUN: usize>(weight: WeightRef<'_>, first: usize, columns: usize, panel: PanelMut<'_>) {
     let rows = weight.shape().0;
     let scales = &mut panel.scales[first..first + rows];

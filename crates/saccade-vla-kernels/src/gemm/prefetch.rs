@@ -1,7 +1,7 @@
-//! Which weights a product asks memory for while it is made, and in which order: one after the other, or as many streams.
+//! Software prefetch of packed weights while a product is made: one line after the other, or as several streams.
 //!
-//! Some CPUs read DRAM faster as several streams than as one: one thread of a Sapphire Rapids 18.7 instead of 11.6 GB/s. Others do not: two
-//! threads of a Zen 4 read 35 GB/s either way (medians of five runs). Bits do not depend on it.
+//! Some CPUs read DRAM faster as several streams than as one: one thread of a Sapphire Rapids 18.7 instead of 11.6 GB/s.
+//! Others do not: two threads of a Zen 4 read 35 GB/s either way (medians of five runs). Bits do not depend on it.
 
 use std::ops::Range;
 
@@ -15,23 +15,23 @@ const STREAM: usize = 1024;
 const MAX_STREAMS: usize = 48;
 
 impl Block<'_> {
-    /// Whether weights are asked for as streams, where a step meets `step_words` of them.
+    /// Whether weights are prefetched as streams, where a step meets `step_words` of them.
     #[inline(always)]
-    pub(super) fn asks_as_streams(&self, step_words: usize) -> bool {
-        // Streams whose steps are one line would ask for each line once a tile. In order, AVX2 was 0.99 to 1.17 times as fast on an Intel with
-        // AMX (float32, bfloat16 widened and int8), AVX-512 with its three lines 0.70 to 1.01 times.
+    pub(super) fn prefetches_streams(&self, step_words: usize) -> bool {
+        // Streams whose steps are one line would ask for each line once a tile. In order, AVX2 was 0.99 to 1.17 times as fast
+        // on an Intel with AMX (float32, bfloat16 widened and int8), AVX-512 with its three lines 0.70 to 1.01 times.
         self.streams && step_words > LINE
     }
 }
 
-/// The panel that a block goes through, in parts: all tiles take one part, then all the next.
+/// The panel that a block goes through, in parts: all calls of the micro-kernel take one part, then all the next.
 pub(super) struct Parts<'a> {
     block: &'a Block<'a>,
     /// Words that a step meets, and the steps of the panel and of a part.
     step_words: usize,
     steps: usize,
     part_steps: usize,
-    /// [`Block::asks_as_streams`].
+    /// [`Block::prefetches_streams`].
     streams: bool,
 }
 
@@ -44,7 +44,7 @@ impl<'a> Parts<'a> {
             step_words,
             steps,
             part_steps,
-            streams: block.asks_as_streams(step_words),
+            streams: block.prefetches_streams(step_words),
         }
     }
 
@@ -68,14 +68,14 @@ impl<'a> Parts<'a> {
         (at, self.part_steps.min(self.steps) * self.step_words)
     }
 
-    /// What tile number `tile` of the block asks for in the steps of `part`, one line in a step.
+    /// What call number `call` of the micro-kernel prefetches in the steps of `part`, one line in a step.
     #[inline(always)]
-    pub(super) fn lines(&self, part: &Range<usize>, tile: usize) -> Lines {
-        let tiles = self.block.range.len();
+    pub(super) fn lines(&self, part: &Range<usize>, call: usize) -> Lines {
+        let calls = self.block.calls.len();
         if !self.streams {
-            // The tile's share of the next panel, spread over its steps.
+            // The call's share of the next panel, spread over its steps.
             let weights = self.block.weights;
-            let (share, pitch) = (weights.len() * tile / tiles, self.step_words.div_ceil(tiles));
+            let (share, pitch) = (weights.len() * call / calls, self.step_words.div_ceil(calls));
             let next = self.block.ahead * weights.len() + share + part.start * pitch;
             return Lines {
                 first: weights.as_ptr().wrapping_add(next),
@@ -87,22 +87,22 @@ impl<'a> Parts<'a> {
         let (at, words) = self.after(part);
         let streams = (words / STREAM).clamp(1, MAX_STREAMS);
         let pitch = words.div_ceil(streams).next_multiple_of(LINE);
-        // Each tile takes its share of all streams, a line of each in a round.
+        // Each call takes its share of all streams, a line of each in a round.
         Lines {
-            first: at.wrapping_add(pitch * tile / tiles),
+            first: at.wrapping_add(pitch * call / calls),
             pitch,
             round: streams,
-            advance: (pitch * streams).div_ceil(tiles * part.len().max(1)),
+            advance: (pitch * streams).div_ceil(calls * part.len().max(1)),
         }
     }
 }
 
 impl Parts<'_> {
     /// The same where steps are long: several lines in each of them.
-    pub(super) fn bursts(&self, part: &Range<usize>, tile: usize) -> Bursts {
-        let tiles = self.block.range.len();
+    pub(super) fn bursts(&self, part: &Range<usize>, call: usize) -> Bursts {
+        let calls = self.block.calls.len();
         if !self.streams {
-            let Lines { first, pitch, .. } = self.lines(part, tile);
+            let Lines { first, pitch, .. } = self.lines(part, call);
             return Bursts {
                 first,
                 lines: pitch.div_ceil(LINE),
@@ -114,17 +114,17 @@ impl Parts<'_> {
         // A line of each stream in a step.
         let pitch = LINE * part.len();
         let streams = words.div_ceil(pitch).min(2 * MAX_STREAMS);
-        let first = streams * tile / tiles;
+        let first = streams * call / calls;
         Bursts {
             first: at.wrapping_add(first * pitch),
-            lines: streams * (tile + 1) / tiles - first,
+            lines: streams * (call + 1) / calls - first,
             pitch,
             advance: LINE,
         }
     }
 }
 
-/// Lines to ask for in each step, `pitch` words apart, and in the next step from `advance` words further on.
+/// Lines to prefetch in each step, `pitch` words apart, and in the next step from `advance` words further on.
 #[derive(Clone, Copy)]
 pub(super) struct Bursts {
     pub first: *const u32,
@@ -133,7 +133,7 @@ pub(super) struct Bursts {
     pub advance: usize,
 }
 
-/// Lines to ask for, one in a step: `pitch` words apart for `round` steps, and then again from `advance` words further.
+/// Lines to prefetch, one in a step: `pitch` words apart for `round` steps, then again from `advance` words further.
 #[derive(Clone, Copy)]
 pub(super) struct Lines {
     pub first: *const u32,
@@ -156,44 +156,41 @@ impl Lines {
 mod tests {
     use std::collections::HashSet;
 
-    use super::super::{Shape, Tiles};
+    use super::super::{RowSplit, Shape};
     use super::*;
+    use crate::rows::Rows;
 
-    /// The lines of the weights that a block asks for, as numbers from the panel's first one on.
+    /// The lines of the weights that a block prefetches, as numbers from the panel's first one on.
     fn asked(
-        [rows, tile_rows]: [usize; 2],
+        [rows, mr]: [usize; 2],
         [steps, step_words, part_steps]: [usize; 3],
         streams: bool,
         lines_of: impl Fn(&Parts<'_>, &Range<usize>, usize) -> Vec<*const u32>,
     ) -> HashSet<isize> {
         let shape = Shape {
-            columns: step_words,
-            tile_rows,
+            nr: step_words,
+            mr,
             row_group: 1,
-            rows_beyond: 0,
         };
-        let tiles = Tiles::new(rows, shape);
+        let split = RowSplit::new(rows, shape);
         let weights = vec![0; steps * step_words];
         let block = Block {
-            x: std::ptr::null(),
-            x_stride: 0,
+            x: Rows::new(&[], 0),
             in_features: steps,
-            tiles,
-            range: 0..tiles.count,
+            split,
+            calls: 0..split.count,
             weights: &weights,
             needed: step_words,
             ahead: 2,
             streams,
-            sums: std::ptr::null_mut(),
             out: std::ptr::null(),
             out_stride: 0,
-            finish: &|_| (),
         };
         let parts = Parts::new(&block, step_words, steps, part_steps);
         let mut asked = HashSet::new();
         for part in parts.iter() {
-            for tile in 0..tiles.count {
-                let lines = lines_of(&parts, &part, tile);
+            for call in 0..split.count {
+                let lines = lines_of(&parts, &part, call);
                 let words = |line: *const u32| (line.addr() as isize - weights.as_ptr().addr() as isize) / 4;
                 asked.extend(
                     lines
@@ -206,9 +203,9 @@ mod tests {
     }
 
     /// One line in a step; more where there are fewer tiles than lines in a step, as the tiles of vectors do.
-    fn of_lines(parts: &Parts<'_>, part: &Range<usize>, tile: usize) -> Vec<*const u32> {
-        let lines = parts.lines(part, tile);
-        let more = (parts.step_words / LINE).div_ceil(parts.block.range.len());
+    fn of_lines(parts: &Parts<'_>, part: &Range<usize>, call: usize) -> Vec<*const u32> {
+        let lines = parts.lines(part, call);
+        let more = (parts.step_words / LINE).div_ceil(parts.block.calls.len());
         let of_step = |step| {
             let (at, left) = lines.at(step);
             assert!((1..=lines.round).contains(&left));
@@ -217,13 +214,13 @@ mod tests {
         (0..part.len()).flat_map(of_step).collect()
     }
 
-    fn of_bursts(parts: &Parts<'_>, part: &Range<usize>, tile: usize) -> Vec<*const u32> {
+    fn of_bursts(parts: &Parts<'_>, part: &Range<usize>, call: usize) -> Vec<*const u32> {
         let Bursts {
             first,
             lines,
             pitch,
             advance,
-        } = parts.bursts(part, tile);
+        } = parts.bursts(part, call);
         let of_step =
             |step: usize| (0..lines).map(move |line| first.wrapping_add(step * advance + line * pitch));
         (0..part.len()).flat_map(of_step).collect()

@@ -1,0 +1,160 @@
+//! Products in the vectors of an instruction set.
+
+use std::marker::PhantomData;
+use std::mem::MaybeUninit;
+
+use super::convert::Convert;
+use super::name::{Joined, join};
+use super::outliers::MultiplyOutliers;
+use super::step::Step;
+use super::{Block, Conversion, Gemm, PanelMut, Shape, pack};
+use crate::simd::{Kernel, Simd};
+use crate::weights::{Element, WeightRef};
+
+/// A loop over the rows of a block and the steps of a panel that is written once for all [`Step`]s.
+///
+/// # Safety
+/// [`Self::multiply`] writes the sums that [`Gemm::multiply`] promises.
+pub(crate) unsafe trait MicroKernel: Sized + Send + Sync + 'static {
+    fn shape<S: Simd, E: Step<Self>>() -> Shape;
+
+    /// What [`Gemm::multiply`] does.
+    ///
+    /// # Safety
+    /// [`Block::check`] was called with the sizes of this micro-kernel and these elements; `S` has the instructions that
+    /// the elements need.
+    unsafe fn multiply<S: Simd, E: Step<Self>>(simd: S, block: &Block<'_>, sums: &mut [MaybeUninit<u32>]);
+
+    /// Steps of the largest tile for some milliseconds, as [`PeakLoop`](super::PeakLoop) has it.
+    ///
+    /// # Safety
+    /// `S` has the instructions that the elements need.
+    #[cfg(feature = "peak")]
+    unsafe fn multiply_for_peak<S: Simd, E: Step<Self>>(simd: S) -> usize;
+}
+
+/// Elements whose instructions the CPU of a token has.
+///
+/// # Safety
+/// That is so. It always is where the step uses operations of the token alone.
+pub(crate) unsafe trait RunsOn<S, L>: Step<L> {}
+
+/// Products of `E` in the vectors of `S` by the micro-kernel `L`.
+pub(crate) struct InVectors<S, E, L = super::broadcast::Broadcast> {
+    simd: S,
+    kinds: PhantomData<(E, L)>,
+}
+
+impl<S: Simd, E: Step<L>, L: MicroKernel> InVectors<S, E, L> {
+    const JOINED: Joined = match E::WEIGHTS {
+        Element::Int8 => join(S::NAME, S::DOT_NAME, E::NAME),
+        _ => join(S::NAME, "", E::NAME),
+    };
+    const NAME: &'static str = Joined::as_str(&Self::JOINED);
+
+    fn panel_words_of(in_features: usize) -> usize {
+        L::shape::<S, E>().nr * (E::DEPTH / E::PER_WORD) * in_features.div_ceil(E::DEPTH)
+    }
+}
+
+// SAFETY: the micro-kernel writes the sums, and its shape is constant.
+unsafe impl<S: Simd, E: RunsOn<S, L>, L: MicroKernel> Gemm for InVectors<S, E, L> {
+    fn new() -> Option<Self> {
+        let kinds = PhantomData;
+        S::new().map(|simd| Self { simd, kinds })
+    }
+
+    fn name(&self) -> &'static str {
+        Self::NAME
+    }
+
+    fn shape(&self) -> Shape {
+        L::shape::<S, E>()
+    }
+
+    fn panel_words(&self, in_features: usize) -> usize {
+        Self::panel_words_of(in_features)
+    }
+
+    fn pack(&self, weight: WeightRef<'_>, first: usize, panel: PanelMut<'_>) {
+        pack::pack::<E>(weight, first, self.shape().nr, panel);
+    }
+
+    fn converted_stride(&self, in_features: usize) -> Option<usize> {
+        E::converted_stride(in_features)
+    }
+
+    fn convert(&self, conversion: Conversion<'_>) {
+        self.simd.run(Convert::<E>::new(conversion));
+    }
+
+    fn multiply(&self, block: &Block<'_>, sums: &mut [MaybeUninit<u32>]) {
+        let row_words = E::converted_stride(block.in_features).unwrap_or(block.in_features);
+        block.check(self.shape(), self.panel_words(block.in_features), row_words, sums);
+        // SAFETY: checked above, and `S` has the instructions because of `RunsOn`.
+        self.simd.run(unsafe { Multiply::<E, L>::new(block, sums) });
+    }
+
+    fn multiply_outliers(&self, outliers: MultiplyOutliers<'_>) {
+        let run = E::GROUP;
+        self.simd.run(MultiplyOutliers { run, ..outliers });
+    }
+}
+
+/// The sums of a block.
+struct Multiply<'a, 'b, E, L> {
+    block: &'a Block<'b>,
+    sums: &'a mut [MaybeUninit<u32>],
+    kinds: PhantomData<(E, L)>,
+}
+
+impl<'a, 'b, E, L> Multiply<'a, 'b, E, L> {
+    /// # Safety
+    /// As [`MicroKernel::multiply`], of the instruction set that this runs on.
+    unsafe fn new(block: &'a Block<'b>, sums: &'a mut [MaybeUninit<u32>]) -> Self {
+        let kinds = PhantomData;
+        Self { block, sums, kinds }
+    }
+}
+
+impl<E: Step<L>, L: MicroKernel> Kernel for Multiply<'_, '_, E, L> {
+    type Output = ();
+
+    #[inline(always)]
+    fn run<S: Simd>(self, simd: S) {
+        // SAFETY: the constructor's contract.
+        unsafe { L::multiply::<S, E>(simd, self.block, self.sums) }
+    }
+}
+
+#[cfg(feature = "peak")]
+impl<S: Simd, E: RunsOn<S, L>, L: MicroKernel> super::PeakLoop for InVectors<S, E, L> {
+    fn multiply_for_peak(&self) -> usize {
+        // SAFETY: `S` has the instructions because of `RunsOn`.
+        self.simd.run(unsafe { Peak::<E, L>::new() })
+    }
+}
+
+/// The steps of a peak.
+#[cfg(feature = "peak")]
+struct Peak<E, L>(PhantomData<(E, L)>);
+
+#[cfg(feature = "peak")]
+impl<E, L> Peak<E, L> {
+    /// # Safety
+    /// As [`MicroKernel::multiply_for_peak`], of the instruction set that this runs on.
+    unsafe fn new() -> Self {
+        Self(PhantomData)
+    }
+}
+
+#[cfg(feature = "peak")]
+impl<E: Step<L>, L: MicroKernel> Kernel for Peak<E, L> {
+    type Output = usize;
+
+    #[inline(always)]
+    fn run<S: Simd>(self, simd: S) -> usize {
+        // SAFETY: the constructor's contract.
+        unsafe { L::multiply_for_peak::<S, E>(simd) }
+    }
+}
