@@ -51,17 +51,20 @@ macro_rules! of_vectors_unless {
     };
 }
 
-/// A line is an instruction set by the name that users give it, slowest first: `Name = "name" if CONDITION { ... }`, and in the braces
-/// (`of "feature"` before the condition: only there where the crate has this feature)
+/// An entry is an instruction set, slowest first, with the name that users give it and the condition under
+/// which it is compiled: `Name = "name" if CONDITION { ... }`. With `of "feature"` before the condition, it
+/// exists only where the crate has this feature. In the braces are
 /// - `vectors`: what every kernel runs on;
-/// - `bf16`, `int8`: instruction sets with the same vectors and an instruction for dot products of these elements; a kernel for dot products
-///   of bfloat16 uses the first of `bf16` that the CPU has, and else `vectors`;
-/// - `gemm_bf16`, `gemm_int8`: products with packed weights of these elements, likewise; those after the last one listed are made of
-///   `vectors` alone;
+/// - `bf16`, `int8`: instruction sets with the same vectors and an instruction for dot products of these
+///   elements; a kernel for dot products of bfloat16 uses the first of `bf16` that the CPU has, and else
+///   `vectors`;
+/// - `gemm_bf16`, `gemm_int8`: products with packed weights of these elements, likewise; those after the last
+///   one listed are made of `vectors` alone;
 /// - `needs`: of these types, the CPU must have at least one;
-/// - `gemm_f32`, `gemm_widened`: float32 rows with float32 weights, and with bfloat16 ones, where these products are not made of `vectors`
-///   either; then no product is.
-/// - `tiles`: the unit that multiplies tiles, where there is one, and which must be there: attention over bfloat16 uses it.
+/// - `gemm_f32`, `gemm_widened`: float32 rows with float32 weights, and with bfloat16 ones, where these
+///   products are not made of `vectors` either; then no product is.
+/// - `tiles`: the unit that multiplies tiles, where there is one, and which must be there: attention over
+///   bfloat16 uses it.
 macro_rules! instruction_sets {
     ($(
         $(#[$doc:meta])*
@@ -225,7 +228,8 @@ instruction_sets! {
     Avx512f = "avx512f" if target_arch = "x86_64" {
         vectors: Avx512, bf16: [], int8: [], gemm_bf16: [], gemm_int8: [], needs: [Avx512],
     }
-    /// AVX-512 with whichever of the dot products AVX512-BF16 and AVX512-VNNI this CPU has; [`Isa::Avx512f`] where it has neither.
+    /// AVX-512 with whichever of the dot products AVX512-BF16 and AVX512-VNNI this CPU has; [`Isa::Avx512f`]
+    /// where it has neither.
     Avx512 = "avx512" if target_arch = "x86_64" {
         vectors: Avx512,
         bf16: [Avx512Bf16],
@@ -234,8 +238,8 @@ instruction_sets! {
         gemm_int8: [InVectors<Avx512Vnni, Int8>],
         needs: [Avx512],
     }
-    /// Tiles in software: what [`Isa::Amx`] computes, bit for bit but for the vectors beside the tiles, at the speed of an emulator. For
-    /// tests; never chosen, and not among [`Isa::available`].
+    /// Tiles in software: what [`Isa::Amx`] computes, bit for bit but for the vectors beside the tiles, at
+    /// the speed of an emulator. For tests; never chosen, and not among [`Isa::available`].
     #[doc(hidden)]
     SoftwareTiles = "software_tiles" of "software-tiles" if feature = "software-tiles" {
         vectors: Loops<TILE>,
@@ -334,7 +338,8 @@ impl Vectors {
     }
 }
 
-/// `SACCADE_ISA` holds a name that is unknown, or of an instruction set that this CPU lacks or the system keeps from this process.
+/// `SACCADE_ISA` holds a name that is unknown, or of an instruction set that this CPU lacks or the system
+/// keeps from this process.
 #[derive(Debug, thiserror::Error)]
 #[error("{ISA_VARIABLE}: expected one of {}, got `{given}`{why}", names(&Isa::available()))]
 pub struct IsaError {
@@ -364,7 +369,8 @@ impl Isa {
         self.name() == "software_tiles"
     }
 
-    /// The dot products that it uses on this CPU: `bf16` (of bfloat16); `vnni`, `dotprod` or `i8mm` (of int8); in tiles, for [`Isa::Amx`].
+    /// The dot products that it uses on this CPU: `bf16` (of bfloat16); `vnni`, `dotprod` or `i8mm` (of
+    /// int8); in tiles, for [`Isa::Amx`].
     ///
     /// ```
     /// assert!(saccade_vla_kernels::Isa::Portable.dot_products().is_empty());

@@ -1,4 +1,5 @@
-//! What this CPU can do at most: multiply-accumulates without memory, the clock they run at, and reading memory. Kernels are compared with it.
+//! What this CPU can do at most: multiply-accumulates without memory, the clock they run at, and reading
+//! memory. Kernels are compared with it.
 
 use std::hint::black_box;
 use std::io;
@@ -19,8 +20,9 @@ const CALLS: usize = 10;
 /// What is read to measure reading: several times any cache.
 const MEMORY: usize = 256 << 20;
 
-/// Streams that reading is measured with: one after the other, and as many as a core has open at a time without effort. Which
-/// is faster depends on the CPU: 18.7 instead of 11.6 GB/s as several streams by one thread of a Sapphire Rapids; two of a Zen 4 read as fast either way.
+/// Streams that reading is measured with: one after the other, and as many as a core has open at a time
+/// without effort. Which is faster depends on the CPU: 18.7 instead of 11.6 GB/s as several streams by one
+/// thread of a Sapphire Rapids; two of a Zen 4 read as fast either way.
 pub const READ_STREAMS: [usize; 2] = [1, 16];
 
 /// Why a peak was not measured.
@@ -40,8 +42,9 @@ pub enum PeakError {
     },
 }
 
-/// The most multiply-accumulates a second that the kernels of `isa` and `arithmetic` could do on `threads` threads, measured in a few
-/// hundredths of a second: the micro-kernels' steps, again and again, with rows and weights in the nearest cache.
+/// The most multiply-accumulates a second that the kernels of `isa` and `arithmetic` could do on `threads`
+/// threads, measured in a few hundredths of a second: the micro-kernels' steps, again and again, with rows
+/// and weights in the nearest cache.
 ///
 /// Where there is no instruction for bfloat16, it is widened to float32 and has the same peak.
 ///
@@ -58,7 +61,8 @@ pub fn macs_per_second(isa: Isa, arithmetic: Arithmetic, threads: usize) -> Resu
     })
 }
 
-/// One sample of [`macs_per_second`], for programs that measure by turns: returns how many multiply-accumulates it has done.
+/// One sample of [`macs_per_second`], for programs that measure by turns: returns how many
+/// multiply-accumulates it has done.
 ///
 /// # Errors
 /// As [`macs_per_second`].
@@ -79,8 +83,8 @@ pub fn kernel_name(isa: Isa, arithmetic: Arithmetic) -> &'static str {
     isa.gemm(arithmetic, Element::F32).name()
 }
 
-/// Bytes a second that `threads` threads read from memory together, each of them as `streams` streams: a few lines of each in turn. Takes a
-/// few tenths of a second.
+/// Bytes a second that `threads` threads read from memory together, each of them as `streams` streams: a few
+/// lines of each in turn. Takes a few tenths of a second.
 ///
 /// # Errors
 /// [`PeakError`] if there is not enough memory, of which 256 MiB are read, or the system refuses a thread.
@@ -108,8 +112,9 @@ fn fastest(rate: impl Fn() -> Result<f64, PeakError>) -> Result<f64, PeakError> 
     (0..CALLS).try_fold(0.0, |largest, _| Ok(f64::max(largest, rate()?)))
 }
 
-/// Cycles a second, from a chain of dependent instructions whose latency every CPU of the architecture has: multiplications of three cycles on
-/// x86-64 (since 2008), additions of one on 64-bit ARM; `None` where it is not known how to measure it.
+/// Cycles a second, from a chain of dependent instructions whose latency every CPU of the architecture has:
+/// multiplications of three cycles on x86-64 (since 2008), additions of one on 64-bit ARM; `None` where it is
+/// not known how to measure it.
 #[must_use]
 pub fn clock_hz() -> Option<f64> {
     #[cfg(any(target_arch = "x86_64", target_arch = "aarch64"))]
@@ -230,7 +235,8 @@ mod tests {
             let expected = match (isa, &isa.dot_products()[..]) {
                 // Six products of 16 x 16 x 16 words next to a dozen of vectors, in an eighth of the steps.
                 (Isa::Amx, _) => [28 * 32, 28 * 64],
-                // Rows of a tile times `k` of a step: seven times four of float32, eight times four of bfloat16.
+                // Rows of a tile times `k` of a step: seven times four of float32, eight times four of
+                // bfloat16.
                 (Isa::Neon, _) => [28, 5 * 16],
                 (Isa::Dotprod, _) => [28, 6 * 16],
                 (Isa::I8mm, _) => [28, 8 * 8],

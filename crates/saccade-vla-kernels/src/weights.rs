@@ -13,8 +13,8 @@ pub enum Arithmetic {
     Float32,
     /// Weights and activations rounded to bf16, products and sums in float32.
     Bfloat16,
-    /// Weights quantised to int8, one scale for each output; activations to 8 bits (7 where the CPU has no int8 dot product), one scale for
-    /// each row; sums in int32.
+    /// Weights quantised to int8, one scale for each output; activations to 8 bits (7 where the CPU has no
+    /// int8 dot product), one scale for each row; sums in int32.
     Int8,
 }
 
@@ -71,12 +71,13 @@ impl WeightRef<'_> {
     }
 }
 
-/// Quantises the rows of `weight (out_features, in_features)` to int8 as [`PackedLinear::pack`](crate::PackedLinear::pack) does:
-/// `scale = max |w| / 127` of the row, `value = w / scale` to the nearest, ties to even. `values` is row-major, `scales` has one element for
-/// each row.
+/// Quantises the rows of `weight (out_features, in_features)` to int8 as
+/// [`PackedLinear::pack`](crate::PackedLinear::pack) does: `scale = max |w| / 127` of the row, `value = w /
+/// scale` to the nearest, ties to even. `values` is row-major, `scales` has one element for each row.
 ///
-/// A row whose elements are all smaller than 127 times the smallest normal number (1.5e-36) becomes zeros with the scale 0; one with NaN or infinity
-/// becomes zeros with the scale NaN. Weights that are int8 already are copied.
+/// A row whose elements are all smaller than 127 times the smallest normal number (1.5e-36) becomes zeros
+/// with the scale 0; one with NaN or infinity becomes zeros with the scale NaN. Weights that are int8 already
+/// are copied.
 ///
 /// # Panics
 /// If `values` or `scales` have another length.
@@ -146,7 +147,8 @@ pub(crate) fn row_scale(weight: &WeightRef<'_>, row: usize) -> f32 {
 /// `value / scale` to the nearest, ties to even; 0 where the scale is 0 or NaN.
 #[inline(always)]
 pub(crate) fn quantize(value: f32, scale: f32) -> i8 {
-    /// Adding it rounds to a whole number, ties to even, which is then the difference of the bits: 1.5 * 2^23.
+    /// Adding it rounds to a whole number, ties to even, which is then the difference of the bits: 1.5 *
+    /// 2^23.
     const ROUND: f32 = 12_582_912.0;
     let steps = (value / scale + ROUND).to_bits().wrapping_sub(ROUND.to_bits()) as i8;
     if scale > 0.0 { steps } else { 0 }

@@ -1,4 +1,5 @@
-//! CPU families on which kernels were measured: the table that chooses between kernels of one instruction set.
+//! CPU families on which kernels were measured: the table that chooses between kernels of one instruction
+//! set.
 //!
 //! A table and no probe at load, so that two runs on one machine use the same kernels and give the same bits.
 
@@ -27,13 +28,14 @@ pub(crate) struct Rates {
     pub streams: bool,
 }
 
-/// Measured by a prototype, before saccade had tiles: `docs/cpus.md`. The others were measured by `make bench-peers`, but for
-/// VDPBF16PS on Intel, where `avx512` does not use it.
+/// Measured by a prototype, before saccade had tiles: `docs/cpus.md`. The others were measured by `make
+/// bench-peers`, but for VDPBF16PS on Intel, where `avx512` does not use it.
 const SAPPHIRE_RAPIDS: Rates = Rates {
     float32: 145.0,
     bf16_dot: 76.0,
-    // Seen with tiles: 274 instead of 154 on one thread at 49 x 1536 x 6144. AVX-512, float32, on an Intel with AMX whose model is hidden:
-    // 1.1 times as fast at 49 x 1536 x 6144, 1.4 times at 49 x 6144 x 1536, 1.0 times at 296 x 2048 x 8192; int8 1.0. AVX2 asks in order.
+    // Seen with tiles: 274 instead of 154 on one thread at 49 x 1536 x 6144. AVX-512, float32, on an Intel
+    // with AMX whose model is hidden: 1.1 times as fast at 49 x 1536 x 6144, 1.4 times at 49 x 6144 x 1536,
+    // 1.0 times at 296 x 2048 x 8192; int8 1.0. AVX2 asks in order.
     streams: true,
 };
 
@@ -41,24 +43,26 @@ const EMERALD_RAPIDS: Rates = Rates {
     float32: 177.0,
     // A loop of 12 chains on each of two cores; float32 reached 182 in the same way.
     bf16_dot: 88.0,
-    // As streams, AVX-512 without AMX, two threads, 49 x 1536 x 6144, 49 x 6144 x 1536, 296 x 2048 x 8192 and 296 x 8192 x 2048: float32 1.05 to
-    // 1.09, 1.15 to 1.20, 1.0 and 1.1 times as fast, bfloat16 1.0, 1.09, 1.0 and 1.03, int8 1.02, 1.06, 1.04 and 1.02.
+    // As streams, AVX-512 without AMX, two threads, 49 x 1536 x 6144, 49 x 6144 x 1536, 296 x 2048 x 8192 and
+    // 296 x 8192 x 2048: float32 1.05 to 1.09, 1.15 to 1.20, 1.0 and 1.1 times as fast, bfloat16 1.0, 1.09,
+    // 1.0 and 1.03, int8 1.02, 1.06, 1.04 and 1.02.
     streams: true,
 };
 
 const ZEN_4: Rates = Rates {
     float32: 114.0,
     bf16_dot: 228.0,
-    // As streams, AVX-512, 49 rows, two threads: int8 1.04 times as fast, bfloat16 1.02, float32 1.0; 296 rows 1.0. The whole head gains nothing,
-    // so in order.
+    // As streams, AVX-512, 49 rows, two threads: int8 1.04 times as fast, bfloat16 1.02, float32 1.0; 296
+    // rows 1.0. The whole head gains nothing, so in order.
     streams: false,
 };
 
 const ZEN_5: Rates = Rates {
     float32: 251.0,
     bf16_dot: 461.0,
-    // As streams, AVX-512, two threads, at 49 x 1536 x 6144 and 49 x 6144 x 1536: int8 1.02 and 0.98 times as fast, bfloat16 0.96 and 0.95, float32
-    // 1.01 and 0.96; at 296 x 2048 x 8192 and 296 x 8192 x 2048 all 0.98 to 0.99.
+    // As streams, AVX-512, two threads, at 49 x 1536 x 6144 and 49 x 6144 x 1536: int8 1.02 and 0.98 times as
+    // fast, bfloat16 0.96 and 0.95, float32 1.01 and 0.96; at 296 x 2048 x 8192 and 296 x 8192 x 2048 all
+    // 0.98 to 0.99.
     streams: false,
 };
 

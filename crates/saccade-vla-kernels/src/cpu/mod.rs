@@ -30,8 +30,8 @@ impl Cpu {
         }
     }
 
-    /// The CPU that this process runs on, detected once. No thread waits for another one that detects it: after a fork
-    /// that one might not be there.
+    /// The CPU that this process runs on, detected once. No thread waits for another one that detects it:
+    /// after a fork that one might not be there.
     pub(crate) fn current() -> &'static Self {
         static CURRENT: OnceBox<Cpu> = OnceBox::new();
         CURRENT.get_or_init(|| Box::new(Self::new(Signature::current())))
@@ -41,7 +41,8 @@ impl Cpu {
         self.measured.map(|family| &family.rates)
     }
 
-    /// Whether AVX512-BF16 multiplies faster than float32 does: what is widened instead has the rate of float32.
+    /// Whether AVX512-BF16 multiplies faster than float32 does: what is widened instead has the rate of
+    /// float32.
     pub(crate) fn has_fast_bf16_dot(&self) -> bool {
         self.rates().is_none_or(|rates| rates.bf16_dot > rates.float32)
     }

@@ -43,14 +43,16 @@ trait Machine {
     /// XCR0. Asked only where OSXSAVE is set.
     fn xcr0(&self) -> u64;
 
-    /// Asks the system to let this process use tile data, now and in later threads. `Err(None)` if there is no such request.
+    /// Asks the system to let this process use tile data, now and in later threads. `Err(None)` if there is
+    /// no such request.
     fn request(&self) -> Result<(), Option<i32>>;
 
     /// The states that this process may use, as bits.
     fn permitted(&self) -> u64;
 }
 
-/// The state of tile data, as a bit of XCR0 and of the kernel's permissions; that of the configuration is the bit before it.
+/// The state of tile data, as a bit of XCR0 and of the kernel's permissions; that of the configuration is the
+/// bit before it.
 const TILE_DATA: u32 = 18;
 
 /// Whether tiles may be used. Nothing is asked of the system before the CPU is known to have all of it.
@@ -95,8 +97,9 @@ fn ask(machine: &impl Machine) -> Result<(), Refusal> {
 
 const ENOSPC: i32 = 28;
 
-/// Whether this process may use tiles. Asked once: the answer holds for all threads, also for those that run already, and for forked
-/// children. XCR0 shows the state without permission too, and the first instruction on a tile would then be SIGILL.
+/// Whether this process may use tiles. Asked once: the answer holds for all threads, also for those that run
+/// already, and for forked children. XCR0 shows the state without permission too, and the first instruction
+/// on a tile would then be SIGILL.
 pub(crate) fn permission() -> Result<(), Refusal> {
     static ANSWER: OnceBox<Result<(), Refusal>> = OnceBox::new();
     *ANSWER.get_or_init(|| {
@@ -242,7 +245,8 @@ mod tests {
         assert_eq!(machine.asked.get(), 1);
     }
 
-    /// A request can fail a later `sigaltstack` of the program: where tiles cannot be used anyway there is none.
+    /// A request can fail a later `sigaltstack` of the program: where tiles cannot be used anyway there is
+    /// none.
     #[test]
     fn nothing_is_asked_of_the_system_without_the_whole_of_amx() {
         type Change = fn(&mut Told);

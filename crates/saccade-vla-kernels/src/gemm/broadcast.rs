@@ -1,9 +1,10 @@
-//! The micro-kernel that broadcasts: a word of each row meets vectors of the panel. For all instruction sets but ARM's.
+//! The micro-kernel that broadcasts: a word of each row meets vectors of the panel. For all instruction sets
+//! but ARM's.
 //!
-//! A panel is `k`-major: `[k / DEPTH][column]`, words of `DEPTH` consecutive `k`, so that one step over `k` reads a few whole
-//! vectors. A row is read where it is, one broadcast word a step. The sums of a tile of rows by panel columns stay in
-//! registers while a part of the summed dimension is walked from front to back; parts are cut at fixed places and added in
-//! order.
+//! A panel is `k`-major: `[k / DEPTH][column]`, words of `DEPTH` consecutive `k`, so that one step over `k`
+//! reads a few whole vectors. A row is read where it is, one broadcast word a step. The sums of a tile of
+//! rows by panel columns stay in registers while a part of the summed dimension is walked from front to back;
+//! parts are cut at fixed places and added in order.
 
 use std::hint::black_box;
 use std::mem::MaybeUninit;
@@ -26,10 +27,10 @@ pub(crate) struct Broadcast;
 // SAFETY: steps of this micro-kernel use operations of the token alone.
 unsafe impl<S: Simd, E: Step<Broadcast>> RunsOn<S, Broadcast> for E {}
 
-/// Steps over the summed dimension after which the next tile takes the same part of the panel, which is then still in the
-/// cache: whole parts. Each begins the rows' streams again; with two parts of float32, together with huge pages for the
-/// weights, AVX2 went from 0.85 to 0.89 of the FMA peak at 49 x 1536 x 6144 on Zen 4, AVX-512 from 0.94 to 0.95 (with one
-/// step a turn).
+/// Steps over the summed dimension after which the next tile takes the same part of the panel, which is then
+/// still in the cache: whole parts. Each begins the rows' streams again; with two parts of float32, together
+/// with huge pages for the weights, AVX2 went from 0.85 to 0.89 of the FMA peak at 49 x 1536 x 6144 on Zen 4,
+/// AVX-512 from 0.94 to 0.95 (with one step a turn).
 const BLOCK_STEPS: usize = 1024;
 
 // SAFETY: all rows of the block and all vectors of needed columns are written.
@@ -46,8 +47,8 @@ unsafe impl MicroKernel for Broadcast {
     #[inline(always)]
     unsafe fn multiply<S: Simd, E: Step<Self>>(simd: S, block: &Block<'_>, sums: &mut [MaybeUninit<u32>]) {
         const { assert!(S::TILE_VECTORS <= 3) }
-        // 128 outputs are 8 vectors of AVX-512, not the 9 of three whole panels: a head of width 128 took 0.93 of the time on
-        // one thread of a Zen 4.
+        // 128 outputs are 8 vectors of AVX-512, not the 9 of three whole panels: a head of width 128 took
+        // 0.93 of the time on one thread of a Zen 4.
         let used = block.needed.div_ceil(S::LANES);
         let sums = sums.as_mut_ptr().cast();
         // SAFETY: the contract of this function, and `sums` has room for the rows of the block.
@@ -82,8 +83,8 @@ unsafe impl MicroKernel for Broadcast {
     }
 }
 
-/// A step of `MR` rows by `NV` vectors, again and again. Their sums, twelve where registers have room for them, hide the
-/// latency of the multiply-adds; rows and weights are in the nearest cache.
+/// A step of `MR` rows by `NV` vectors, again and again. Their sums, twelve where registers have room for
+/// them, hide the latency of the multiply-adds; rows and weights are in the nearest cache.
 ///
 /// # Safety
 /// As [`MicroKernel::multiply_for_peak`].
@@ -98,7 +99,8 @@ unsafe fn peak<S: Simd, E: Step<Broadcast>, const NV: usize, const MR: usize>(si
         // Hidden, because products that do not change would be computed once.
         let (x, weights) = (black_box(x.as_ptr()), black_box(weights.as_ptr()));
         let rows = std::array::from_fn(|row| x.wrapping_add(row));
-        // SAFETY: there is a word for each of up to six rows, and a vector of weights for each of up to three sums.
+        // SAFETY: there is a word for each of up to six rows, and a vector of weights for each of up to three
+        // sums.
         unsafe { E::multiply_add::<S, NV, MR>(simd, &mut sums, &rows, 0, weights, 1) };
     }
     black_box(&sums);
@@ -124,9 +126,9 @@ unsafe fn panel_rows<S: Simd, E: Step<Broadcast>, const NV: usize, const UV: usi
         let part = E::Sums::PART / E::DEPTH;
         assert!(part > BLOCK_STEPS || (BLOCK_STEPS / 2).is_multiple_of(part));
     }
-    // As streams, a part is prefetched while the one before it is multiplied. One of 1024 steps after one of 512 would take
-    // twice the pace: parts of 512 made 1536 steps 1.04 to 1.08 times as fast (AVX-512, float32, Intel with AMX), and no
-    // difference where 1024 divides them. Families of AMD prefetch in order.
+    // As streams, a part is prefetched while the one before it is multiplied. One of 1024 steps after one of
+    // 512 would take twice the pace: parts of 512 made 1536 steps 1.04 to 1.08 times as fast (AVX-512,
+    // float32, Intel with AMX), and no difference where 1024 divides them. Families of AMD prefetch in order.
     let is_uneven = steps > BLOCK_STEPS && !steps.is_multiple_of(BLOCK_STEPS);
     let part_steps = if is_uneven && block.prefetches_streams(step_words) {
         BLOCK_STEPS / 2
@@ -137,7 +139,8 @@ unsafe fn panel_rows<S: Simd, E: Step<Broadcast>, const NV: usize, const UV: usi
     for part in parts.iter() {
         for call in block.calls.clone() {
             let Range { start: row, end } = block.split.rows(&(call..call + 1));
-            // SAFETY: the rows are in the block, their sums within the block's, and the part within the panel.
+            // SAFETY: the rows are in the block, their sums within the block's, and the part within the
+            // panel.
             unsafe {
                 let tile = Tile {
                     row,
@@ -192,8 +195,8 @@ struct Tile {
 /// `MR` rows by `UV` vectors of `NV` over one part of `k`.
 ///
 /// # Safety
-/// As [`panel_rows`]; the block has rows `tile.row .. tile.row + MR`, the panel the steps in `part`, and `tile.sums` room for
-/// the rows.
+/// As [`panel_rows`]; the block has rows `tile.row .. tile.row + MR`, the panel the steps in `part`, and
+/// `tile.sums` room for the rows.
 #[inline(always)]
 unsafe fn tile_part<S: Simd, E: Step<Broadcast>, const NV: usize, const UV: usize, const MR: usize>(
     simd: S,
@@ -203,9 +206,10 @@ unsafe fn tile_part<S: Simd, E: Step<Broadcast>, const NV: usize, const UV: usiz
 ) {
     const UNROLLED: usize = 4;
     let row_elements = NV * S::LANES;
-    // Loop and address arithmetic competes with the multiply-adds for execution ports on Intel: with one step a turn 0.87 of
-    // the rate of the whole head with AVX2 in float32 and bfloat16 (Intel with AMX, two threads). Eight gain no more. But
-    // without VNNI a product of int8 is three instructions, and four steps a turn made the head 0.86 times as fast.
+    // Loop and address arithmetic competes with the multiply-adds for execution ports on Intel: with one step
+    // a turn 0.87 of the rate of the whole head with AVX2 in float32 and bfloat16 (Intel with AMX, two
+    // threads). Eight gain no more. But without VNNI a product of int8 is three instructions, and four steps
+    // a turn made the head 0.86 times as fast.
     let unrolled = if E::PER_WORD < 4 || S::MAX_BYTE == u8::MAX {
         UNROLLED
     } else {
@@ -234,17 +238,18 @@ unsafe fn tile_part<S: Simd, E: Step<Broadcast>, const NV: usize, const UV: usiz
     loop {
         let end = part.end.min(first + E::Sums::PART / E::DEPTH);
         let mut sums = [[E::Sums::zero(simd); UV]; MR];
-        // SAFETY: rows and weights have the steps before `end`; of the last one, rows have the rest of their elements. There
-        // is room for the sums.
+        // SAFETY: rows and weights have the steps before `end`; of the last one, rows have the rest of their
+        // elements. There is room for the sums.
         unsafe {
             // Rows that are not converted may end within the last step.
             let whole = end.min(block.in_features / E::DEPTH);
-            // Few rows leave little time: a step's share is then longer than a cache line. The loops are apart because one
-            // register more for the general case makes the common one spill.
+            // Few rows leave little time: a step's share is then longer than a cache line. The loops are
+            // apart because one register more for the general case makes the common one spill.
             let mut step = first;
             while step < whole {
-                // Memory works while the sums are made. Measured at 49 x 1536 x 6144 on Zen 4, in order, share of the FMA
-                // peak without and with it, with one step a turn: 0.89 and 0.95 (AVX-512), 0.69 and 0.85 (AVX2).
+                // Memory works while the sums are made. Measured at 49 x 1536 x 6144 on Zen 4, in order,
+                // share of the FMA peak without and with it, with one step a turn: 0.89 and 0.95 (AVX-512),
+                // 0.69 and 0.85 (AVX2).
                 let (mut next, steps) = tile.ahead.at(step - part.start);
                 // Hidden: compilers find the smaller of the two again in each step.
                 let round = step..black_box(whole.min(step + steps));
@@ -305,8 +310,8 @@ unsafe fn keep<S: Simd, E: Step<Broadcast>, const NV: usize, const UV: usize, co
     to: *mut u32,
     adds: bool,
 ) {
-    // SAFETY: the contract of this function. Loops of their own: with a branch inside, they would not be unrolled, and the
-    // sums would be in memory.
+    // SAFETY: the contract of this function. Loops of their own: with a branch inside, they would not be
+    // unrolled, and the sums would be in memory.
     unsafe {
         if adds {
             for (r, row) in sums.iter_mut().enumerate() {

@@ -105,16 +105,16 @@ fn narrow<S: Simd>(simd: S, x: &[f32], place: Place, to: &mut [u16]) {
     }
 }
 
-/// Quantises a row to `0 ..= S::MAX_BYTE`, over the range of its values and zero: `byte = zero + round(x / scale)`, ties to
-/// even; `signed` bytes are less by 128.
+/// Quantises a row to `0 ..= S::MAX_BYTE`, over the range of its values and zero: `byte = zero + round(x /
+/// scale)`, ties to even; `signed` bytes are less by 128.
 ///
-/// Relative error of a layer of 1536 inputs with int8 weights, all standard normal, and in brackets that of symmetric
-/// quantisation: 0.0113 (0.0115); of rows after GELU 0.0102 (0.0143); with four channels ten times as large 0.0234 (0.0308).
-/// The weights alone are 0.0081 of it. With bytes up to 129, as without VNNI: 0.0173 (0.0187), 0.0146 (0.0247),
-/// 0.0435 (0.0616).
+/// Relative error of a layer of 1536 inputs with int8 weights, all standard normal, and in brackets that of
+/// symmetric quantisation: 0.0113 (0.0115); of rows after GELU 0.0102 (0.0143); with four channels ten times
+/// as large 0.0234 (0.0308). The weights alone are 0.0081 of it. With bytes up to 129, as without VNNI:
+/// 0.0173 (0.0187), 0.0146 (0.0247), 0.0435 (0.0616).
 ///
-/// A row that is nowhere larger than about 1e-36 counts as zero. One with NaN or infinity gets the scale NaN. If outliers are
-/// to be kept apart, they are zeros in the bytes.
+/// A row that is nowhere larger than about 1e-36 counts as zero. One with NaN or infinity gets the scale NaN.
+/// If outliers are to be kept apart, they are zeros in the bytes.
 #[inline(always)]
 fn quantize<S: Simd>(
     simd: S,
@@ -144,8 +144,8 @@ fn quantize<S: Simd>(
     quantized
 }
 
-/// How a row is quantised, and what its elements are multiplied with: one over the scale, or zero for a row that counts as
-/// zero. If outliers are to be kept apart, they are found here.
+/// How a row is quantised, and what its elements are multiplied with: one over the scale, or zero for a row
+/// that counts as zero. If outliers are to be kept apart, they are found here.
 #[inline(always)]
 fn quantization<S: Simd>(simd: S, x: &[f32], outliers: Option<&mut Outliers>) -> (Quantized, f32) {
     let zero = simd.splat(0.0);

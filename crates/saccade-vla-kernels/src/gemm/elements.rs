@@ -1,4 +1,5 @@
-//! What rows and weights are made of: how they are stored, and how the vectors of most instruction sets multiply them.
+//! What rows and weights are made of: how they are stored, and how the vectors of most instruction sets
+//! multiply them.
 
 use super::broadcast::Broadcast;
 use super::odd_lines;
@@ -14,8 +15,8 @@ pub(crate) trait Elements: Send + Sync + Sized + 'static {
     const WEIGHTS: Element;
     /// Elements of rows.
     const ROWS: RowElements;
-    /// Rows that alternate in memory by eight bytes, and words of a column that are next to each other in a panel: 2 for
-    /// instructions that multiply two rows by two columns.
+    /// Rows that alternate in memory by eight bytes, and words of a column that are next to each other in a
+    /// panel: 2 for instructions that multiply two rows by two columns.
     const GROUP: usize = 1;
     /// What sums are.
     type Sums: Sums;
@@ -55,7 +56,8 @@ pub(crate) enum RowElements {
     Bf16,
     /// Quantised to `0 ..= Simd::MAX_BYTE`.
     UnsignedBytes,
-    /// Quantised to -128 ..= 127: bytes and zero points are 128 less than unsigned ones, and products are the same.
+    /// Quantised to -128 ..= 127: bytes and zero points are 128 less than unsigned ones, and products are the
+    /// same.
     #[cfg_attr(
         not(target_arch = "aarch64"),
         allow(dead_code, reason = "for instructions of NEON")
@@ -127,8 +129,8 @@ macro_rules! widening_steps {
     ($($elements:ident),+) => {$(
         impl Step<Broadcast> for $elements {
             const DEPTH: usize = 2;
-            // Shares of the FMA peak at 296 x 2048 x 1536 on Zen 4: 8 and 7 rows of AVX-512 0.77 and 0.97, 6 and 5 rows of AVX2 0.70
-            // and 0.88.
+            // Shares of the FMA peak at 296 x 2048 x 1536 on Zen 4: 8 and 7 rows of AVX-512 0.77 and 0.97, 6
+            // and 5 rows of AVX2 0.70 and 0.88.
             const FEWER_GROUPS: usize = 1;
 
             #[inline(always)]
@@ -141,7 +143,8 @@ macro_rules! widening_steps {
                 count: usize,
             ) {
                 for part in 0..count {
-                    // SAFETY: the contract names a vector of weights for each of the sums, and `count` words of each row.
+                    // SAFETY: the contract names a vector of weights for each of the sums, and `count` words
+                    // of each row.
                     unsafe {
                         let mut w = [simd.splat(0.0); NV];
                         for (v, w) in w.iter_mut().enumerate() {
@@ -181,7 +184,8 @@ macro_rules! step_of_dots {
                 weights: *const u32,
                 _: usize,
             ) {
-                // SAFETY: the contract names a vector of weights for each of the sums, and a word of each row.
+                // SAFETY: the contract names a vector of weights for each of the sums, and a word of each
+                // row.
                 unsafe {
                     let mut w = [simd.splat_i32(0); NV];
                     for (v, w) in w.iter_mut().enumerate() {

@@ -1,4 +1,5 @@
-//! Products in tiles, of bfloat16 in pairs and of bytes in quads: what AMX multiplies, and its emulation in software.
+//! Products in tiles, of bfloat16 in pairs and of bytes in quads: what AMX multiplies, and its emulation in
+//! software.
 
 use std::marker::PhantomData;
 use std::mem::MaybeUninit;
@@ -17,7 +18,8 @@ use crate::simd::bits::cast_slice_mut;
 use crate::tiles::{Ahead, MAX_ROWS, Operation, Product, Session, TILE, TileUnit};
 use crate::weights::{Element, WeightRef};
 
-/// Columns of a panel: three tiles, because six tiles of sums, one of rows and one of weights are all that there are.
+/// Columns of a panel: three tiles, because six tiles of sums, one of rows and one of weights are all that
+/// there are.
 const COLUMNS: usize = 3 * TILE;
 
 const _: () = assert!(COLUMNS <= MAX_NR && MAX_ROWS <= MAX_MR);
@@ -28,12 +30,13 @@ const STEP_WORDS: usize = TILE * COLUMNS;
 /// Steps of a part of a panel at most: 192 kB, and in as many steps a line of each of 48 streams of 4 kB.
 const PART_STEPS: usize = 64;
 
-/// Bytes of the rows that go through a panel together at most. Products in tiles are so fast that weights come from memory
-/// no faster than they are used: as many rows as fit into the second-level cache beside the panel, 2 MB where there is AMX.
+/// Bytes of the rows that go through a panel together at most. Products in tiles are so fast that weights
+/// come from memory no faster than they are used: as many rows as fit into the second-level cache beside the
+/// panel, 2 MB where there is AMX.
 const ROW_BYTES: usize = 5 << 18;
 
-/// Products of `E` in the tiles of `U`. A panel is what those of vectors are, `[k / elements of a word][column]`, in whole
-/// steps of 16 words.
+/// Products of `E` in the tiles of `U`. A panel is what those of vectors are, `[k / elements of a
+/// word][column]`, in whole steps of 16 words.
 pub(crate) struct InTiles<U, E> {
     unit: U,
     elements: PhantomData<E>,
@@ -64,7 +67,8 @@ impl<U: TileUnit, E: Elements> InTiles<U, E> {
     }
 }
 
-// SAFETY: all steps write or add to the sums of all rows and columns, the first of them writes; the sizes are constant.
+// SAFETY: all steps write or add to the sums of all rows and columns, the first of them writes; the sizes are
+// constant.
 unsafe impl<U: TileUnit, E: Elements> Gemm for InTiles<U, E> {
     fn new() -> Option<Self> {
         let elements = PhantomData;
@@ -102,7 +106,8 @@ unsafe impl<U: TileUnit, E: Elements> Gemm for InTiles<U, E> {
 
     fn convert(&self, mut conversion: Conversion<'_>) {
         if E::ROWS == RowElements::Bf16 {
-            // Up to whole tiles: what may be NaN would make NaN of the zeros that it is multiplied by. Of bytes any may follow.
+            // Up to whole tiles: what may be NaN would make NaN of the zeros that it is multiplied by. Of
+            // bytes any may follow.
             let width = conversion.x.num_columns();
             for row in conversion.words.iter_mut() {
                 let row: &mut [u16] = cast_slice_mut(row);
@@ -124,8 +129,8 @@ unsafe impl<U: TileUnit, E: Elements> Gemm for InTiles<U, E> {
             sums[..block.rows().len() * COLUMNS].fill(MaybeUninit::new(0));
             return finish(block.rows(), sums);
         }
-        // Sums stay in their tiles over a part: on their way to memory and back they cost more than weights that are read
-        // again from the second-level cache.
+        // Sums stay in their tiles over a part: on their way to memory and back they cost more than weights
+        // that are read again from the second-level cache.
         let part_steps = steps.div_ceil(steps.div_ceil(PART_STEPS)).next_multiple_of(8);
         let parts = Parts::new(block, STEP_WORDS, steps, part_steps);
         // SAFETY: no other session is open, and finishing uses no tiles.
@@ -156,8 +161,9 @@ unsafe impl<U: TileUnit, E: Elements> Gemm for InTiles<U, E> {
                 };
                 // SAFETY: `check` found the rows in the block, the steps in the panel, and room for the sums.
                 unsafe { session.multiply(&product) };
-                // At once, while the sums are in the nearest cache and the results on their way to it: `encode` of N1.5
-                // takes 0.95 (bfloat16) and 0.91 (int8) of the time with all rows after the panel (Intel with AMX, 2 threads).
+                // At once, while the sums are in the nearest cache and the results on their way to it:
+                // `encode` of N1.5 takes 0.95 (bfloat16) and 0.91 (int8) of the time with all rows after the
+                // panel (Intel with AMX, 2 threads).
                 if is_last {
                     finish(rows, sums);
                 }
@@ -177,8 +183,8 @@ impl<U: TileUnit, E: Elements> super::PeakLoop for InTiles<U, E> {
     }
 }
 
-/// What call number `call` prefetches while it goes through `part`: some lines after each product. All of a step at once
-/// cost 20 to 60 % (Sapphire Rapids).
+/// What call number `call` prefetches while it goes through `part`: some lines after each product. All of a
+/// step at once cost 20 to 60 % (Sapphire Rapids).
 fn ahead(parts: &Parts<'_>, part: &Range<usize>, call: usize, rows: usize) -> Ahead {
     const WORD: usize = size_of::<u32>();
     let products = if rows > TILE { 6 } else { 3 };

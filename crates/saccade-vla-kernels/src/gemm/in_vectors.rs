@@ -21,8 +21,8 @@ pub(crate) unsafe trait MicroKernel: Sized + Send + Sync + 'static {
     /// What [`Gemm::multiply`] does.
     ///
     /// # Safety
-    /// [`Block::check`] was called with the sizes of this micro-kernel and these elements; `S` has the instructions that
-    /// the elements need.
+    /// [`Block::check`] was called with the sizes of this micro-kernel and these elements; `S` has the
+    /// instructions that the elements need.
     unsafe fn multiply<S: Simd, E: Step<Self>>(simd: S, block: &Block<'_>, sums: &mut [MaybeUninit<u32>]);
 
     /// Steps of the largest tile for some milliseconds, as [`PeakLoop`](super::PeakLoop) has it.

@@ -1,9 +1,9 @@
-//! Products of rows with packed weights (GEMM), each by one instruction set and of one kind of elements: its shape, how
-//! weights are packed and rows converted for it, and the micro-kernel.
+//! Products of rows with packed weights (GEMM), each by one instruction set and of one kind of elements: its
+//! shape, how weights are packed and rows converted for it, and the micro-kernel.
 //!
-//! In BLIS's words: a micro-kernel multiplies `mr` rows by a panel of `nr` columns, whose sums stay in registers. There
-//! are two for vectors, [`broadcast`] and, on ARM, [`neon`]; both are generic over a [`Step`](step::Step). A third is for
-//! tile units, [`in_tiles`].
+//! In BLIS's words: a micro-kernel multiplies `mr` rows by a panel of `nr` columns, whose sums stay in
+//! registers. There are two for vectors, [`broadcast`] and, on ARM, [`neon`]; both are generic over a
+//! [`Step`](step::Step). A third is for tile units, [`in_tiles`].
 
 pub(crate) mod broadcast;
 mod convert;
@@ -45,8 +45,8 @@ pub(crate) const MAX_NR: usize = 48;
 /// Rows of the largest micro-kernel: two tiles of 16.
 const MAX_MR: usize = 32;
 
-/// Rows that go through a panel together, or a few more: their activations should stay in the second-level cache while the
-/// panel streams past. 96 rows of 2048 are 768 kB, three quarters of a 1 MB cache.
+/// Rows that go through a panel together, or a few more: their activations should stay in the second-level
+/// cache while the panel streams past. 96 rows of 2048 are 768 kB, three quarters of a 1 MB cache.
 pub(crate) const ROW_BLOCK: usize = 96;
 
 /// Rows of the largest block of any product, that of tiles; or a few more.
@@ -55,8 +55,9 @@ pub(crate) const MAX_ROW_BLOCK: usize = 320;
 /// Words of the sums of the largest block of rows and a panel.
 pub(crate) const MAX_SUMS: usize = (MAX_ROW_BLOCK + MAX_MR) * MAX_NR;
 
-/// Products that are summed from zero. One running float32 sum over the 8192 inputs of a feed-forward loses five times as
-/// much as parts of 512 do (measured on the full head). Equal on all instruction sets, and so are their bits.
+/// Products that are summed from zero. One running float32 sum over the 8192 inputs of a feed-forward loses
+/// five times as much as parts of 512 do (measured on the full head). Equal on all instruction sets, and so
+/// are their bits.
 const SUM_PART: usize = 512;
 
 /// How a row was quantised: `x = scale * (byte - zero)`, with `zero` its zero point.
@@ -91,8 +92,8 @@ pub(crate) struct Conversion<'a> {
     pub outliers: Option<RowsMut<'a, Outliers>>,
 }
 
-/// How the rows of a call are dealt to calls of the micro-kernel: evenly and in whole groups, so that 49 are 7 times 7, not
-/// 6 times 8 and one of 1.
+/// How the rows of a call are dealt to calls of the micro-kernel: evenly and in whole groups, so that 49 are
+/// 7 times 7, not 6 times 8 and one of 1.
 #[derive(Clone, Copy)]
 pub(crate) struct RowSplit {
     rows: usize,
@@ -129,8 +130,8 @@ impl RowSplit {
 
 /// A block of rows, and the panel that multiplies it.
 pub(crate) struct Block<'a> {
-    /// The rows of the whole call, in whole groups: what [`Gemm::convert`] made, or the bits of float32 where rows are not
-    /// converted.
+    /// The rows of the whole call, in whole groups: what [`Gemm::convert`] made, or the bits of float32 where
+    /// rows are not converted.
     pub x: Rows<'a, u32>,
     pub in_features: usize,
     pub split: RowSplit,
@@ -144,7 +145,8 @@ pub(crate) struct Block<'a> {
     pub ahead: usize,
     /// Whether to prefetch weights as many streams, rather than one line after the other.
     pub streams: bool,
-    /// Where row 0 of the results of this panel will be written afterwards. Prefetched only, so any address will do.
+    /// Where row 0 of the results of this panel will be written afterwards. Prefetched only, so any address
+    /// will do.
     pub out: *const f32,
     /// Elements from one row of them to the next.
     pub out_stride: usize,
@@ -179,16 +181,17 @@ impl Block<'_> {
     }
 }
 
-/// A product of rows with packed weights on one instruction set. [`PackedLinear`](crate::PackedLinear) splits rows and
-/// panels, and makes results of the sums.
+/// A product of rows with packed weights on one instruction set. [`PackedLinear`](crate::PackedLinear) splits
+/// rows and panels, and makes results of the sums.
 ///
-/// An implementation sums each element in an order that depends on nothing but `in_features`: neither on the number of rows
-/// nor on where a row is. The sums are float32, and of int8 they are int32, of which
+/// An implementation sums each element in an order that depends on nothing but `in_features`: neither on the
+/// number of rows nor on where a row is. The sums are float32, and of int8 they are int32, of which
 /// `scales[column] * quantized[row].scale * (sum - quantized[row].zero * sums[column])` is the product.
 ///
 /// # Safety
-/// [`Self::multiply`] and [`Self::multiply_and_finish`] write what they say: the sums are read afterwards. [`Self::shape`]
-/// never changes, and `nr`, `mr` and [`Self::row_block`] are at most [`MAX_NR`], [`MAX_MR`] and [`MAX_ROW_BLOCK`].
+/// [`Self::multiply`] and [`Self::multiply_and_finish`] write what they say: the sums are read afterwards.
+/// [`Self::shape`] never changes, and `nr`, `mr` and [`Self::row_block`] are at most [`MAX_NR`], [`MAX_MR`]
+/// and [`MAX_ROW_BLOCK`].
 pub(crate) unsafe trait Gemm: PeakLoop + Send + Sync {
     /// The kernel, if this CPU has the instructions.
     fn new() -> Option<Self>
@@ -217,11 +220,12 @@ pub(crate) unsafe trait Gemm: PeakLoop + Send + Sync {
     /// Converts rows, where [`Self::converted_stride`] is not `None`.
     fn convert(&self, conversion: Conversion<'_>);
 
-    /// Writes the sums of a block of rows times a panel to rows of `nr` words, from the first row of the block on: those of
-    /// [`Block::needed`] columns at least.
+    /// Writes the sums of a block of rows times a panel to rows of `nr` words, from the first row of the
+    /// block on: those of [`Block::needed`] columns at least.
     fn multiply(&self, block: &Block<'_>, sums: &mut [MaybeUninit<u32>]);
 
-    /// The same, and calls `finish` once for each row of the block, with all sums, when those of the row are complete.
+    /// The same, and calls `finish` once for each row of the block, with all sums, when those of the row are
+    /// complete.
     fn multiply_and_finish(&self, block: &Block<'_>, sums: &mut [MaybeUninit<u32>], finish: Finish<'_>) {
         self.multiply(block, sums);
         finish(block.rows(), sums);
@@ -231,14 +235,15 @@ pub(crate) unsafe trait Gemm: PeakLoop + Send + Sync {
     fn multiply_outliers(&self, outliers: MultiplyOutliers<'_>);
 }
 
-/// What makes results of the sums of some rows of the call, within all sums of the block. It uses vectors, never tiles.
+/// What makes results of the sums of some rows of the call, within all sums of the block. It uses vectors,
+/// never tiles.
 pub(crate) type Finish<'a> = &'a dyn Fn(Range<usize>, &[MaybeUninit<u32>]);
 
 /// The loop that measures what the instruction of a product can do at most.
 #[cfg(feature = "peak")]
 pub(crate) trait PeakLoop {
-    /// Multiplies words in registers and the nearest cache for some milliseconds; returns how many multiply-accumulates
-    /// that were.
+    /// Multiplies words in registers and the nearest cache for some milliseconds; returns how many
+    /// multiply-accumulates that were.
     fn multiply_for_peak(&self) -> usize;
 }
 
@@ -253,8 +258,8 @@ pub(crate) fn available<G: Gemm + 'static>() -> Option<Box<dyn Gemm>> {
     Some(Box::new(G::new()?))
 }
 
-/// Words of a converted row with `per_word` elements in a word: whole cache lines, an odd number of them. Rows at multiples
-/// of a page would compete for the same few places in the cache.
+/// Words of a converted row with `per_word` elements in a word: whole cache lines, an odd number of them.
+/// Rows at multiples of a page would compete for the same few places in the cache.
 fn odd_lines(in_features: usize, per_word: usize) -> usize {
     in_features.div_ceil(per_word).next_multiple_of(LINE) | LINE
 }

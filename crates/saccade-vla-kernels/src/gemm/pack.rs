@@ -1,5 +1,5 @@
-//! Panels that are words of consecutive `k` of one column: `[k / PER_WORD][column]`, the first `k` lowest, zeros where there
-//! are no more. Of elements with groups, as many words of a column are next to each other.
+//! Panels that are words of consecutive `k` of one column: `[k / PER_WORD][column]`, the first `k` lowest,
+//! zeros where there are no more. Of elements with groups, as many words of a column are next to each other.
 
 use super::PanelMut;
 use super::elements::Elements;
@@ -76,10 +76,11 @@ fn put_int8<const RUN: usize>(weight: WeightRef<'_>, first: usize, columns: usiz
     }
 }
 
-/// Writes `bits(row, element)` of all elements, `STEP` of which make a word, the first one lowest; `RUN` words of a column stay together.
+/// Writes `bits(row, element)` of all elements, `STEP` of which make a word, the first one lowest; `RUN`
+/// words of a column stay together.
 ///
-/// In blocks, so that neither the reading nor the writing side jumps through memory at every element; what is in a block is known to the
-/// compiler, which makes vectors of it.
+/// In blocks, so that neither the reading nor the writing side jumps through memory at every element; what is
+/// in a block is known to the compiler, which makes vectors of it.
 fn put<T: Copy, const STEP: usize, const RUN: usize>(
     to_words: &mut [u32],
     columns: usize,

@@ -1,7 +1,9 @@
-//! Software prefetch of packed weights while a product is made: one line after the other, or as several streams.
+//! Software prefetch of packed weights while a product is made: one line after the other, or as several
+//! streams.
 //!
-//! Some CPUs read DRAM faster as several streams than as one: one thread of a Sapphire Rapids 18.7 instead of 11.6 GB/s.
-//! Others do not: two threads of a Zen 4 read 35 GB/s either way (medians of five runs). Bits do not depend on it.
+//! Some CPUs read DRAM faster as several streams than as one: one thread of a Sapphire Rapids 18.7 instead of
+//! 11.6 GB/s. Others do not: two threads of a Zen 4 read 35 GB/s either way (medians of five runs). Bits do
+//! not depend on it.
 
 use std::ops::Range;
 
@@ -11,20 +13,23 @@ use crate::simd::LINE;
 /// Words of a stream: a page, because the CPU's own prefetching follows one stream in each.
 const STREAM: usize = 1024;
 
-/// Streams of a stretch of weights at most. A whole panel of 6144 inputs overflows the second-level cache before it is used.
+/// Streams of a stretch of weights at most. A whole panel of 6144 inputs overflows the second-level cache
+/// before it is used.
 const MAX_STREAMS: usize = 48;
 
 impl Block<'_> {
     /// Whether weights are prefetched as streams, where a step meets `step_words` of them.
     #[inline(always)]
     pub(super) fn prefetches_streams(&self, step_words: usize) -> bool {
-        // Streams whose steps are one line would ask for each line once a tile. In order, AVX2 was 0.99 to 1.17 times as fast
-        // on an Intel with AMX (float32, bfloat16 widened and int8), AVX-512 with its three lines 0.70 to 1.01 times.
+        // Streams whose steps are one line would ask for each line once a tile. In order, AVX2 was 0.99 to
+        // 1.17 times as fast on an Intel with AMX (float32, bfloat16 widened and int8), AVX-512 with its
+        // three lines 0.70 to 1.01 times.
         self.streams && step_words > LINE
     }
 }
 
-/// The panel that a block goes through, in parts: all calls of the micro-kernel take one part, then all the next.
+/// The panel that a block goes through, in parts: all calls of the micro-kernel take one part, then all the
+/// next.
 pub(super) struct Parts<'a> {
     block: &'a Block<'a>,
     /// Words that a step meets, and the steps of the panel and of a part.
@@ -133,7 +138,8 @@ pub(super) struct Bursts {
     pub advance: usize,
 }
 
-/// Lines to prefetch, one in a step: `pitch` words apart for `round` steps, then again from `advance` words further.
+/// Lines to prefetch, one in a step: `pitch` words apart for `round` steps, then again from `advance` words
+/// further.
 #[derive(Clone, Copy)]
 pub(super) struct Lines {
     pub first: *const u32,
@@ -143,7 +149,8 @@ pub(super) struct Lines {
 }
 
 impl Lines {
-    /// Where the line of step number `step` of the part is, and how many steps are left of its round, this one included.
+    /// Where the line of step number `step` of the part is, and how many steps are left of its round, this
+    /// one included.
     #[inline(always)]
     pub(super) fn at(&self, step: usize) -> (*const u32, usize) {
         let (round, within) = (step / self.round, step % self.round);
@@ -247,7 +254,8 @@ mod tests {
                     false => asked(rows, sizes, streams, of_lines),
                     true => asked(rows, sizes, streams, of_bursts),
                 };
-                // In order: the panel that this thread takes next. As streams: the parts after the first, and the first of that panel.
+                // In order: the panel that this thread takes next. As streams: the parts after the first, and
+                // the first of that panel.
                 let first = (part_steps * step_words / LINE) as isize;
                 let wanted: HashSet<isize> = match streams && step_words > LINE {
                     false => (2 * panel..3 * panel).collect(),

@@ -53,17 +53,18 @@ pub(crate) type SumVector<S, E> = <<E as Elements>::Sums as Sums>::Vector<S>;
 pub(crate) trait Step<L>: Elements {
     /// Consecutive `k` of a step.
     const DEPTH: usize;
-    /// Groups of rows by which the largest tile of sums is smaller than it could be: a step takes registers, too.
+    /// Groups of rows by which the largest tile of sums is smaller than it could be: a step takes registers,
+    /// too.
     const FEWER_GROUPS: usize = 0;
 
-    /// `sums += x W` over step number `step`, of which the first `count` of [`Self::DEPTH`] elements are there. `MR` counts
-    /// groups of rows, `NV` vectors of sums.
+    /// `sums += x W` over step number `step`, of which the first `count` of [`Self::DEPTH`] elements are
+    /// there. `MR` counts groups of rows, `NV` vectors of sums.
     ///
     /// Loops, not closures: a closure is a function without the target features until it is inlined.
     ///
     /// # Safety
-    /// `weights` points to the words of the step, each of `x` to a group of rows in which the step's first `count` elements
-    /// can be read. `S` has the instructions that these elements need.
+    /// `weights` points to the words of the step, each of `x` to a group of rows in which the step's first
+    /// `count` elements can be read. `S` has the instructions that these elements need.
     unsafe fn multiply_add<S: Simd, const NV: usize, const MR: usize>(
         simd: S,
         sums: &mut [[SumVector<S, Self>; NV]; MR],

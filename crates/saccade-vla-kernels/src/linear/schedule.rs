@@ -1,23 +1,24 @@
-//! The schedule of a layer: the order in which blocks of rows pass its panels, so that weights come from memory once however
-//! many rows there are.
+//! The schedule of a layer: the order in which blocks of rows pass its panels, so that weights come from
+//! memory once however many rows there are.
 //!
-//! All rows in one block would need no schedule, but their activations would not stay in a core's cache. One block after the
-//! other through all panels reads weights that are larger than the caches once a block: 17 times for 32 observations of 49
-//! rows. Panels are therefore taken in groups that the shared cache holds. All blocks pass a group before the next group
-//! begins, so its panels come from memory with the first block only, and activations are read once a group.
+//! All rows in one block would need no schedule, but their activations would not stay in a core's cache. One
+//! block after the other through all panels reads weights that are larger than the caches once a block: 17
+//! times for 32 observations of 49 rows. Panels are therefore taken in groups that the shared cache holds.
+//! All blocks pass a group before the next group begins, so its panels come from memory with the first block
+//! only, and activations are read once a group.
 //!
-//! Bytes from memory where the shared cache holds a group but not the layer, bf16, 1568 rows, 2 threads: 1536 x 6144 reads
-//! 43 MB (326 MB block by block), 6144 x 1536 reads 96 MB (340 MB). The multiply-adds take 6 ms at the peak of two Sapphire
-//! Rapids cores with AMX, in which they can read 160 MB.
+//! Bytes from memory where the shared cache holds a group but not the layer, bf16, 1568 rows, 2 threads: 1536
+//! x 6144 reads 43 MB (326 MB block by block), 6144 x 1536 reads 96 MB (340 MB). The multiply-adds take 6 ms
+//! at the peak of two Sapphire Rapids cores with AMX, in which they can read 160 MB.
 //!
-//! Threads that take turns have lanes of panels: the first takes them from the front of a group on, the second from its
-//! middle. Panels next to each other are never written at the same time, since a core that asks for a cache line of results
-//! also asks for its neighbour, which the other core is writing. The weights of a thread follow each other, too. `sample` of
-//! N1.5 takes 0.88 (int8) and 0.94 (bfloat16) of the time with panels dealt by turns (Intel with AMX, 2 threads; float32
-//! 0.98; not measured on AMD).
+//! Threads that take turns have lanes of panels: the first takes them from the front of a group on, the
+//! second from its middle. Panels next to each other are never written at the same time, since a core that
+//! asks for a cache line of results also asks for its neighbour, which the other core is writing. The weights
+//! of a thread follow each other, too. `sample` of N1.5 takes 0.88 (int8) and 0.94 (bfloat16) of the time
+//! with panels dealt by turns (Intel with AMX, 2 threads; float32 0.98; not measured on AMD).
 
-/// Bytes of the panels of a group: less than a few cores' part of the shared cache (2 to 4 MB a core on servers), and several
-/// times the activations of a block.
+/// Bytes of the panels of a group: less than a few cores' part of the shared cache (2 to 4 MB a core on
+/// servers), and several times the activations of a block.
 const GROUP_BYTES: usize = 4 << 20;
 
 /// Tasks of a call: each a block of rows through a panel.
@@ -31,7 +32,8 @@ pub(super) struct Schedule {
 }
 
 impl Schedule {
-    /// `blocks` of rows through `panels` of `panel_bytes` on `threads`, each of which has at least `per_thread` panels of a group.
+    /// `blocks` of rows through `panels` of `panel_bytes` on `threads`, each of which has at least
+    /// `per_thread` panels of a group.
     pub(super) fn new(
         blocks: usize,
         panels: usize,
@@ -57,8 +59,8 @@ impl Schedule {
         self.blocks * self.panels
     }
 
-    /// The block and the panel of task number `task`. Within a group, blocks outside and panels inside: threads then share a
-    /// block of activations.
+    /// The block and the panel of task number `task`. Within a group, blocks outside and panels inside:
+    /// threads then share a block of activations.
     pub(super) fn at(&self, task: usize) -> (usize, usize) {
         let Self {
             blocks,
@@ -78,8 +80,8 @@ impl Schedule {
         (block, first + lane_first + step)
     }
 
-    /// How many panels further the one is that the thread of `task` probably takes next. Zero where it takes an earlier one,
-    /// which the first block has brought into a cache.
+    /// How many panels further the one is that the thread of `task` probably takes next. Zero where it takes
+    /// an earlier one, which the first block has brought into a cache.
     pub(super) fn ahead(&self, task: usize) -> usize {
         let next = task + self.threads;
         if next >= self.tasks() {

@@ -1,6 +1,7 @@
 //! Tiles of AMX. Stable Rust has no intrinsics for them; `asm!` takes the instructions as they are.
 //!
-//! No sum is in a tile between two `asm!` blocks: only the sizes outlive a block, and the compiler uses no tiles.
+//! No sum is in a tile between two `asm!` blocks: only the sizes outlive a block, and the compiler uses no
+//! tiles.
 
 use std::mem::offset_of;
 
@@ -25,7 +26,8 @@ macro_rules! tiles {
     };
 }
 
-/// Prefetches a few cache lines after a product: the CPU's own prefetching follows each of their streams. All at once they would stall it.
+/// Prefetches a few cache lines after a product: the CPU's own prefetching follows each of their streams. All
+/// at once they would stall it.
 macro_rules! prefetch_ahead {
     () => {
         concat!(
@@ -41,7 +43,8 @@ macro_rules! prefetch_ahead {
     };
 }
 
-/// The tile of sums number `$sum` plus rows (tile 6) times the weights that are `$column` bytes from the first (into tile 7).
+/// The tile of sums number `$sum` plus rows (tile 6) times the weights that are `$column` bytes from the
+/// first (into tile 7).
 macro_rules! product {
     ($operation:literal, $sum:literal, $column:literal) => {
         concat!(
@@ -72,7 +75,8 @@ macro_rules! products_apart {
     };
 }
 
-/// Tiles of sums to zero, or from memory, and back to it: each `tile, bytes from the first of its rows`. The first row is at `$rows` of the job.
+/// Tiles of sums to zero, or from memory, and back to it: each `tile, bytes from the first of its rows`. The
+/// first row is at `$rows` of the job.
 macro_rules! each_sum {
     (zero: $($tile:literal),+) => {
         concat!($("tilezero tmm", $tile, "\n"),+)
@@ -91,7 +95,8 @@ macro_rules! each_sum {
     };
 }
 
-/// Tiles of rows by tiles of columns, as a function of the job: sums from zero or memory, the steps, sums to memory.
+/// Tiles of rows by tiles of columns, as a function of the job: sums from zero or memory, the steps, sums to
+/// memory.
 macro_rules! kernel {
     ($name:ident, zero $zero:expr, load $load:expr, step [$($step:expr),+], store $store:expr $(, apart: $apart:ident)? $(, two: $second:ident)?) => {
         /// # Safety
@@ -142,7 +147,8 @@ macro_rules! kernel {
     };
 }
 
-/// A tile of rows by as many of columns as are listed: each `tile, bytes from the first of its rows in the sums`.
+/// A tile of rows by as many of columns as are listed: each `tile, bytes from the first of its rows in the
+/// sums`.
 macro_rules! row_kernel {
     ($operation:literal, $name:ident, $($tile:literal, $column:literal);+) => {
         kernel!(
@@ -178,7 +184,8 @@ macro_rules! products_of_two {
     };
 }
 
-/// Two tiles of rows by as many of columns as are listed: each `tile of the first rows, of the second, bytes in the sums`.
+/// Two tiles of rows by as many of columns as are listed: each `tile of the first rows, of the second, bytes
+/// in the sums`.
 macro_rules! two_rows_kernel {
     ($operation:literal, $name:ident, $($first:literal, $second:literal, $column:literal);+) => {
         kernel!(
@@ -205,8 +212,8 @@ macro_rules! two_rows_kernel {
     };
 }
 
-/// Two tiles of rows by three of columns, next to each other. Six tiles of sums, one of rows and one of weights, which are read twice from the
-/// nearest cache.
+/// Two tiles of rows by three of columns, next to each other. Six tiles of sums, one of rows and one of
+/// weights, which are read twice from the nearest cache.
 macro_rules! block_kernel {
     ($operation:literal, $name:ident) => {
         kernel!(

@@ -1,6 +1,8 @@
-//! Products in tiles: a unit that multiplies tiles of 16 rows and 16 words, in hardware (AMX) or in software, and how products are dealt to it.
+//! Products in tiles: a unit that multiplies tiles of 16 rows and 16 words, in hardware (AMX) or in software,
+//! and how products are dealt to it.
 //!
-//! What drives a unit is written once for both, so that all of it but the instructions themselves runs on every machine.
+//! What drives a unit is written once for both, so that all of it but the instructions themselves runs on
+//! every machine.
 
 #[cfg(target_arch = "x86_64")]
 pub(crate) mod amx;
@@ -43,8 +45,8 @@ impl Operation {
     }
 }
 
-/// What a product prefetches: after each product of tiles `lines` cache lines, `pitch` bytes apart, from `at` on in the first step and
-/// from `advance` bytes further on in each later one. Any address will do.
+/// What a product prefetches: after each product of tiles `lines` cache lines, `pitch` bytes apart, from `at`
+/// on in the first step and from `advance` bytes further on in each later one. Any address will do.
 #[derive(Clone, Copy)]
 pub(crate) struct Ahead {
     pub at: *const u8,
@@ -78,8 +80,8 @@ pub(crate) struct Product {
     pub w_column: usize,
     /// Words from one step to the next.
     pub w_step: usize,
-    /// Tiles next to each other in the sums: `1 ..= MAX_COLUMN_TILES` where there are at most [`TILE`] rows, else 1, 2, or 3 that are next to
-    /// each other in `w` too. Always 3 of int8.
+    /// Tiles next to each other in the sums: `1 ..= MAX_COLUMN_TILES` where there are at most [`TILE`] rows,
+    /// else 1, 2, or 3 that are next to each other in `w` too. Always 3 of int8.
     pub columns: usize,
     /// Steps of [`TILE`] words over which is summed, at least one.
     pub steps: usize,
@@ -111,7 +113,8 @@ pub(crate) struct Job {
     pub ahead_lines: usize,
 }
 
-/// Tiles of rows and of columns of a [`Job`]: what units have kernels for; of int8 only those with three of columns.
+/// Tiles of rows and of columns of a [`Job`]: what units have kernels for; of int8 only those with three of
+/// columns.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Shape {
     /// One by `1 ..= MAX_COLUMN_TILES`, anywhere.
@@ -122,8 +125,8 @@ pub(crate) enum Shape {
     Block,
 }
 
-/// The sizes of all tiles, as LDTILECFG reads them. Tiles 0 to 5 hold sums, 6 rows, 7 weights; with [`Shape::TwoRows`], which has at most
-/// four tiles of sums, 5 holds the second rows.
+/// The sizes of all tiles, as LDTILECFG reads them. Tiles 0 to 5 hold sums, 6 rows, 7 weights; with
+/// [`Shape::TwoRows`], which has at most four tiles of sums, 5 holds the second rows.
 #[repr(C, align(64))]
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Config {
@@ -163,11 +166,12 @@ impl Config {
 
 /// A unit that multiplies tiles.
 ///
-/// Each element of the sums is computed from its row of `x`, its column of `w` and what it was, in the same order whatever the number of
-/// rows, columns and steps of a job.
+/// Each element of the sums is computed from its row of `x`, its column of `w` and what it was, in the same
+/// order whatever the number of rows, columns and steps of a job.
 ///
 /// # Safety
-/// A value exists only where the instructions may be used. The methods read and write only what their contracts name.
+/// A value exists only where the instructions may be used. The methods read and write only what their
+/// contracts name.
 pub(crate) unsafe trait TileUnit: Copy + Send + Sync + 'static {
     /// Vectors of 16 lanes that work beside it. They quantise to whole bytes.
     type Simd: Simd;
@@ -202,7 +206,8 @@ pub(crate) unsafe trait TileUnit: Copy + Send + Sync + 'static {
     /// Does a job.
     ///
     /// # Safety
-    /// The tiles have their sizes; all pointers of `job` are valid for as many rows, for its steps and for the columns of `shape`.
+    /// The tiles have their sizes; all pointers of `job` are valid for as many rows, for its steps and for
+    /// the columns of `shape`.
     unsafe fn run(self, registers: &mut Self::Registers, operation: Operation, shape: Shape, job: &Job);
 
     /// Multiplies tiles in registers for some milliseconds; returns how many multiply-accumulates that were.
@@ -238,13 +243,14 @@ impl<U: TileUnit> Session<U> {
 
     /// Does `product`.
     ///
-    /// More rows than a tile has are dealt to two tiles of equal size, which share a row if their number is odd: both compute and store the
-    /// same sums of it. So no row is touched that is not there, and a tile costs what it has rows.
+    /// More rows than a tile has are dealt to two tiles of equal size, which share a row if their number is
+    /// odd: both compute and store the same sums of it. So no row is touched that is not there, and a tile
+    /// costs what it has rows.
     ///
     /// # Safety
     /// All pointers are valid for what `product` names; rows of `sums` hold 16 words for each column.
-    // Inlined, so that the job is written once: a product read back from memory by wider loads than it was stored waits for all stores
-    // before it, tiles of sums among them (Intel with AMX: 8 % of attention).
+    // Inlined, so that the job is written once: a product read back from memory by wider loads than it was
+    // stored waits for all stores before it, tiles of sums among them (Intel with AMX: 8 % of attention).
     #[inline(always)]
     pub(crate) unsafe fn multiply(&mut self, product: &Product) {
         const WORD: usize = size_of::<u32>();

@@ -1,4 +1,5 @@
-//! Tiles in software: what AMX does, bit for bit, with its rules about sizes. A rule that is broken here would be SIGILL there.
+//! Tiles in software: what AMX does, bit for bit, with its rules about sizes. A rule that is broken here
+//! would be SIGILL there.
 
 use super::{Config, Job, Operation, Shape, TILE, TileUnit, W, X};
 use crate::simd::Simd;
@@ -118,8 +119,9 @@ fn high_half(word: u32) -> f32 {
     flushed(f32::from_bits(word & 0xffff_0000))
 }
 
-/// A row of TDPBF16PS: the first and the second elements of the pairs are summed apart, each from zero; then both sums together, and then
-/// with what was there. So measured on a Sapphire Rapids, on two million sums of normal numbers, wide exponents, denormals and any bits.
+/// A row of TDPBF16PS: the first and the second elements of the pairs are summed apart, each from zero; then
+/// both sums together, and then with what was there. So measured on a Sapphire Rapids, on two million sums of
+/// normal numbers, wide exponents, denormals and any bits.
 pub(super) fn bf16_row(sums: &mut [u32; TILE], x: &[u32], w: &Tile) {
     let (mut first, mut second) = ([0.0; TILE], [0.0; TILE]);
     for (x, w) in x.iter().zip(w) {
@@ -134,8 +136,8 @@ pub(super) fn bf16_row(sums: &mut [u32; TILE], x: &[u32], w: &Tile) {
 
 /// `sums += x w`, rounded once.
 pub(super) fn add_products(sums: &mut [f32; TILE], x: f32, w: &[f32; TILE]) {
-    // A product of two bfloat16 has 16 digits: in float32 it is exact, unless it is too small or too large. Then the sum is rounded once, as
-    // by a fused multiply-add, which many CPUs' baseline lacks.
+    // A product of two bfloat16 has 16 digits: in float32 it is exact, unless it is too small or too large.
+    // Then the sum is rounded once, as by a fused multiply-add, which many CPUs' baseline lacks.
     let products = w.map(|w| x * w);
     let is_exact = |(product, w): (&f32, &f32)| {
         (product.abs() >= f32::MIN_POSITIVE && product.is_finite()) || x == 0.0 || *w == 0.0

@@ -1,8 +1,9 @@
 //! A block of rows through one panel of [`COLUMNS`] columns: the loops that all products on NEON share.
 //!
-//! A step takes a vector of every group of rows, and all that the panel has for it. A group is one row, of which an
-//! instruction takes an element by lane, or two that an instruction multiplies by two columns. Seven rows by three vectors,
-//! or four pairs of rows by six pairs of columns, are the largest tiles whose sums, rows and weights 32 registers hold.
+//! A step takes a vector of every group of rows, and all that the panel has for it. A group is one row, of
+//! which an instruction takes an element by lane, or two that an instruction multiplies by two columns. Seven
+//! rows by three vectors, or four pairs of rows by six pairs of columns, are the largest tiles whose sums,
+//! rows and weights 32 registers hold.
 
 #[cfg(feature = "peak")]
 use std::hint::black_box;
@@ -68,8 +69,8 @@ unsafe impl MicroKernel for Lanes {
     #[inline(always)]
     unsafe fn multiply<S: Simd, E: Step<Self>>(simd: S, block: &Block<'_>, sums: &mut [MaybeUninit<u32>]) {
         let sums = sums.as_mut_ptr().cast();
-        // SAFETY: the contract of this function, and `sums` has room for the rows of the block. Vectors of sums are of four
-        // columns of a row, or of two columns of two.
+        // SAFETY: the contract of this function, and `sums` has room for the rows of the block. Vectors of
+        // sums are of four columns of a row, or of two columns of two.
         unsafe {
             match E::GROUP {
                 1 => panel_rows::<S, E, 3>(simd, block, sums),
@@ -149,7 +150,8 @@ unsafe fn panel_rows<S: Simd, E: Step<Lanes>, const NV: usize>(simd: S, block: &
                 call: call - block.calls.start,
                 rows,
             };
-            // SAFETY: the rows are in the block, their sums within the block's, and the part within the panel.
+            // SAFETY: the rows are in the block, their sums within the block's, and the part within the
+            // panel.
             unsafe {
                 match tile.rows.len().div_ceil(E::GROUP) {
                     1 => tile_part::<S, E, NV, 1>(simd, block, &part, &tile),
@@ -166,7 +168,8 @@ unsafe fn panel_rows<S: Simd, E: Step<Lanes>, const NV: usize>(simd: S, block: &
     }
 }
 
-/// The weights of a part in float32. Widening in the tiles would take an eighth of the time of their multiply-adds.
+/// The weights of a part in float32. Widening in the tiles would take an eighth of the time of their
+/// multiply-adds.
 #[inline(always)]
 fn widen<S: Simd>(simd: S, panel: &[u32], to: &mut [MaybeUninit<u32>]) -> *const u32 {
     for (pairs, to) in panel.chunks_exact(COLUMNS).zip(to.chunks_exact_mut(2 * COLUMNS)) {
@@ -184,7 +187,8 @@ fn widen<S: Simd>(simd: S, panel: &[u32], to: &mut [MaybeUninit<u32>]) -> *const
     to.as_ptr().cast()
 }
 
-/// A tile of sums: its rows, the weights of the part, where its sums go, and its number among those of the block.
+/// A tile of sums: its rows, the weights of the part, where its sums go, and its number among those of the
+/// block.
 struct Tile {
     rows: Range<usize>,
     weights: *const u32,
@@ -195,7 +199,8 @@ struct Tile {
 /// `MR` groups of rows by `NV` vectors over the steps in `part`.
 ///
 /// # Safety
-/// As [`panel_rows`]; the block has the tile's rows, `tile.sums` room for them, and `tile.weights` the part's.
+/// As [`panel_rows`]; the block has the tile's rows, `tile.sums` room for them, and `tile.weights` the
+/// part's.
 #[inline(always)]
 unsafe fn tile_part<S: Simd, E: Step<Lanes>, const NV: usize, const MR: usize>(
     simd: S,
@@ -230,10 +235,11 @@ unsafe fn tile_part<S: Simd, E: Step<Lanes>, const NV: usize, const MR: usize>(
             end
         };
         let mut sums = [[E::Sums::zero(simd); NV]; MR];
-        // SAFETY: rows and weights have the steps before `end`; of the last one, rows have the rest of their elements.
+        // SAFETY: rows and weights have the steps before `end`; of the last one, rows have the rest of their
+        // elements.
         unsafe {
-            // Few rows leave little time: a step's share of the later panel is then longer than a cache line. The loops are
-            // apart so that each is one block without a branch.
+            // Few rows leave little time: a step's share of the later panel is then longer than a cache line.
+            // The loops are apart so that each is one block without a branch.
             if pitch > LINE {
                 for step in first..whole {
                     for line in 0..panel_step::<E>().div_ceil(LINE) {
@@ -264,8 +270,8 @@ unsafe fn tile_part<S: Simd, E: Step<Lanes>, const NV: usize, const MR: usize>(
                 }
                 E::multiply_add(simd, &mut sums, &last_x, 0, weights, E::DEPTH);
             }
-            // Groups by name: if a loop found them by number, the sums would be in memory, and stored there again in every
-            // step.
+            // Groups by name: if a loop found them by number, the sums would be in memory, and stored there
+            // again in every step.
             macro_rules! keep {
                 ($($group:literal)*) => {$(
                     if $group < MR {

@@ -1,4 +1,5 @@
-//! The micro-kernel of NEON, whose instructions take an element of a row by lane, or multiply two rows by two columns.
+//! The micro-kernel of NEON, whose instructions take an element of a row by lane, or multiply two rows by two
+//! columns.
 
 mod micro_kernel;
 mod steps;

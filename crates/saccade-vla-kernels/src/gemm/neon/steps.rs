@@ -133,8 +133,8 @@ unsafe fn lane<S: Simd, E: ByLane, const NV: usize, const MR: usize, const LANE:
     }
 }
 
-/// Elements whose instruction multiplies two rows by two columns: `sums[2 i + j] += rows[i] . columns[j]`, of eight bytes
-/// each.
+/// Elements whose instruction multiplies two rows by two columns: `sums[2 i + j] += rows[i] . columns[j]`, of
+/// eight bytes each.
 trait ByMatrix: Elements {
     /// # Safety
     /// The CPU has the instruction.
@@ -217,8 +217,8 @@ steps! {
     RoundedBf16 by by_lane of F32, 4 k, 0 groups fewer;
     MatrixBf16 by by_matrix of MatrixBf16, 4 k, 3 groups fewer;
     I8mmInt8 by by_matrix of I8mmInt8, 8 k, 3 groups fewer;
-    // With seven rows, as of float32, compilers spill: 82 instead of 92 % of the throughput that llvm-mca predicts for the
-    // Cortex-A76.
+    // With seven rows, as of float32, compilers spill: 82 instead of 92 % of the throughput that llvm-mca
+    // predicts for the Cortex-A76.
     DotprodInt8 by by_lane of DotprodInt8, 16 k, 1 groups fewer;
 }
 
@@ -292,8 +292,8 @@ unsafe fn two_words<
     }
 }
 
-/// `sum` and four products of each lane, in two halves: of `k` 0 and 1 of a word with the low halves of `x` and `w`, of
-/// another word's with the high ones. Two products of at most 128 * 127 fit into 16 bits.
+/// `sum` and four products of each lane, in two halves: of `k` 0 and 1 of a word with the low halves of `x`
+/// and `w`, of another word's with the high ones. Two products of at most 128 * 127 fit into 16 bits.
 #[inline]
 #[target_feature(enable = "neon")]
 fn four(sum: int32x4_t, low_x: int8x16_t, high_x: int8x16_t, w: int8x16_t) -> int32x4_t {
