@@ -119,9 +119,9 @@ fn main() {
         }));
     }
     for contender in &mut contenders {
-        contender.threads = head.num_threads();
+        contender.threads = head.engine().threads;
     }
-    let name = format!("N1.5, {}", head.isa());
+    let name = format!("N1.5, {}", head.engine().isa);
     report.case(&name, &measure(&options, &mut contenders));
     report.end(&options);
 }

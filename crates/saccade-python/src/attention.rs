@@ -63,7 +63,7 @@ impl CrossAttention {
 
     #[getter]
     fn precision(&self) -> String {
-        self.0.precision().to_string()
+        self.0.engine().precision.to_string()
     }
 
     #[getter]

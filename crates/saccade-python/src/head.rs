@@ -81,17 +81,17 @@ impl ActionHead {
 
     #[getter]
     fn num_threads(&self) -> usize {
-        self.0.num_threads()
+        self.0.engine().threads
     }
 
     #[getter]
     fn precision(&self) -> String {
-        self.0.precision().to_string()
+        self.0.engine().precision.to_string()
     }
 
     #[getter]
     fn isa(&self) -> String {
-        self.0.isa().to_string()
+        self.0.engine().isa.to_string()
     }
 
     #[getter]

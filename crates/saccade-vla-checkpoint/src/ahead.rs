@@ -6,7 +6,7 @@ use std::sync::mpsc::{Receiver, Sender, SyncSender, channel, sync_channel};
 use std::thread::Builder;
 
 use crate::elements::Elements;
-use crate::error::{Result, granted};
+use crate::error::{Result, probe_allocation};
 use crate::reader::Checkpoint;
 
 /// Address space that must be free before a thread is started: with little more than a stack, the standard library aborts the process when
@@ -51,7 +51,7 @@ impl Checkpoint {
         let (spare, used) = channel();
         std::thread::scope(|scope| {
             let read = move || read_all(self, wanted, &sender, &used);
-            let thread = match granted("source", THREAD_ROOM) {
+            let thread = match probe_allocation("source", THREAD_ROOM) {
                 Ok(()) => Builder::new()
                     .name("saccade-read".to_owned())
                     .spawn_scoped(scope, read)

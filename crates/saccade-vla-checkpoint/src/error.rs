@@ -222,11 +222,11 @@ pub fn reserve<T>(what: &'static str, values: &mut Vec<T>, len: usize) -> Result
     })
 }
 
-/// Checks that the system grants this many bytes, which it says before they are used.
+/// Allocates this many bytes and frees them: checks that the system grants them, before any is used.
 ///
 /// # Errors
 /// [`Error::Memory`] if it does not.
-pub fn granted(what: &'static str, bytes: usize) -> Result<()> {
+pub fn probe_allocation(what: &'static str, bytes: usize) -> Result<()> {
     reserve(what, &mut Vec::<u8>::new(), bytes)
 }
 
@@ -370,7 +370,7 @@ mod tests {
     fn sizes_have_suitable_units() {
         assert_eq!(show_bytes(999), "999 bytes of memory");
         assert_eq!(show_bytes(12_345_678), "12345678 bytes of memory (12.3 MB)");
-        let error = granted("source", usize::MAX).unwrap_err().to_string();
+        let error = probe_allocation("source", usize::MAX).unwrap_err().to_string();
         assert_eq!(
             error,
             "source: cannot allocate 18446744073709551615 bytes of memory (18.4 EB)"

@@ -28,7 +28,7 @@ pub use adapter::{ADAPTER_CONFIG, ADAPTER_WEIGHTS};
 pub use ahead::{ReadAhead, Wanted};
 pub use companions::{Companions, OWN_CONFIG};
 pub use elements::Elements;
-pub use error::{Error, Problem, Result, granted, printable, reserve, show_bytes, show_shape};
+pub use error::{Error, Problem, Result, printable, probe_allocation, reserve, show_bytes, show_shape};
 pub use names::plain_name;
 pub use reader::Checkpoint;
 /// The types that tensors are stored in.

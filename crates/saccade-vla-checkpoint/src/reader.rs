@@ -11,7 +11,7 @@ use safetensors::tensor::TensorInfo;
 
 use crate::adapter::{refuse_adapter, refuse_use_peft};
 use crate::elements::{Elements, check_int8};
-use crate::error::{Error, Problem, Result, granted, reserve, show_shape};
+use crate::error::{Error, Problem, Result, probe_allocation, reserve, show_shape};
 use crate::header::Header;
 use crate::index::WeightFiles;
 use crate::names::plain_name;
@@ -162,7 +162,7 @@ impl Checkpoint {
     /// As [`Checkpoint::read`].
     pub fn read_f32(&self, name: &str) -> Result<Vec<f32>> {
         let elements: usize = self.entry(name)?.info.shape.iter().product();
-        granted("source", elements.saturating_mul(size_of::<f32>()))?;
+        probe_allocation("source", elements.saturating_mul(size_of::<f32>()))?;
         self.read(name)?.into_f32()
     }
 

@@ -30,8 +30,8 @@ fn main() -> Result<()> {
         config.version.to_uppercase(),
         config.num_layers,
         config.width,
-        head.isa(),
-        head.num_threads(),
+        head.engine().isa,
+        head.engine().threads,
         head.nbytes() as f64 / 1e6
     );
 

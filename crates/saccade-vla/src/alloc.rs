@@ -1,6 +1,6 @@
 //! Memory whose size a caller decides: asked for, never assumed.
 
-use saccade_vla_kernels::Activations;
+use saccade_vla_kernels::{Activations, Rows, RowsMut};
 
 use crate::error::{Error, Result};
 use crate::ops::{check_interrupted, refused};
@@ -28,7 +28,7 @@ pub(crate) fn filled<T: Clone>(what: &'static str, len: usize, value: T) -> Resu
     Ok(buffer)
 }
 
-/// Elements that are written between two looks at whether the call is to stop: the system hands out pages as they are first touched, some
+/// Elements written between two checks for interruption: the system hands out pages as they are first touched, some
 /// four gigabytes in a second.
 const TOGETHER: usize = 1 << 24;
 
@@ -61,15 +61,73 @@ pub(crate) fn collected<T>(
     Ok(buffer)
 }
 
-/// Sets the length of a buffer that keeps its memory from call to call, for elements that are then written: what they are before depends on
-/// earlier calls.
+/// A copy of rows.
 ///
 /// # Errors
-/// [`Error::Memory`] if the system refuses it, [`Error::Interrupted`].
-pub(crate) fn sized(buffer: &mut Activations, len: usize) -> Result<&mut [f32]> {
-    buffer.reserve(len).map_err(refused("activations"))?;
-    in_stretches(buffer.len(), len, |len| buffer.resize(len))?;
+/// [`Error::Memory`] if the system refuses it.
+pub(crate) fn copied(what: &'static str, rows: Rows<'_>) -> Result<Vec<f32>> {
+    let mut buffer = Vec::new();
+    reserve(what, &mut buffer, rows.num_rows() * rows.num_columns())?;
+    rows.iter().for_each(|row| buffer.extend_from_slice(row));
     Ok(buffer)
+}
+
+/// Memory for rows of one call, kept for later calls. The rows are there to be written: what they hold at first
+/// depends on earlier calls.
+#[derive(Default)]
+pub(crate) struct Scratch {
+    memory: Activations,
+    num_rows: usize,
+    num_columns: usize,
+}
+
+impl Scratch {
+    /// Gives the rows this shape.
+    ///
+    /// # Errors
+    /// [`Error::Memory`] if the system refuses it, [`Error::Interrupted`].
+    pub(crate) fn rows(&mut self, num_rows: usize, num_columns: usize) -> Result<RowsMut<'_>> {
+        self.slice(product("activations", &[num_rows, num_columns])?)?;
+        (self.num_rows, self.num_columns) = (num_rows, num_columns);
+        Ok(self.as_rows_mut())
+    }
+
+    /// Gives it this many elements, as one row.
+    ///
+    /// # Errors
+    /// As [`Self::rows`].
+    pub(crate) fn slice(&mut self, len: usize) -> Result<&mut [f32]> {
+        (self.num_rows, self.num_columns) = (0, 0);
+        self.memory.reserve(len).map_err(refused("activations"))?;
+        in_stretches(self.memory.len(), len, |len| self.memory.resize(len))?;
+        (self.num_rows, self.num_columns) = (1, len);
+        Ok(&mut self.memory)
+    }
+
+    /// The rows as they were last shaped.
+    pub(crate) fn as_rows(&self) -> Rows<'_> {
+        Rows::strided(&self.memory, self.num_rows, self.num_columns, self.num_columns)
+    }
+
+    /// The rows as they were last shaped, to be written.
+    pub(crate) fn as_rows_mut(&mut self) -> RowsMut<'_> {
+        RowsMut::strided(
+            &mut self.memory,
+            self.num_rows,
+            self.num_columns,
+            self.num_columns,
+        )
+    }
+
+    /// The elements of all rows, to be written.
+    pub(crate) fn as_mut_slice(&mut self) -> &mut [f32] {
+        &mut self.memory
+    }
+
+    /// The elements of all rows.
+    pub(crate) fn as_slice(&self) -> &[f32] {
+        &self.memory
+    }
 }
 
 /// The product of `sizes`.
@@ -95,11 +153,23 @@ mod tests {
         let error = filled("features", usize::MAX / 8, 0.0_f32).unwrap_err();
         let expected = format!("features: cannot allocate {} bytes of memory", usize::MAX / 8 * 4);
         assert!(error.to_string().starts_with(&expected), "{error}");
-        let mut buffer = Activations::new();
-        let error = sized(&mut buffer, usize::MAX / 8).unwrap_err();
+        let mut scratch = Scratch::default();
+        let error = scratch.slice(usize::MAX / 8).unwrap_err();
         let expected = format!("activations: cannot allocate {} bytes of memory", usize::MAX);
         assert!(error.to_string().starts_with(&expected), "{error}");
-        assert_eq!(sized(&mut buffer, 3).unwrap(), [0.0; 3], "usable afterwards");
+        assert_eq!(scratch.slice(3).unwrap(), [0.0; 3], "usable afterwards");
+    }
+
+    #[test]
+    fn scratch_rows_keep_their_shape() {
+        let mut scratch = Scratch::default();
+        scratch.rows(2, 3).unwrap().row_mut(1).fill(5.0);
+        assert_eq!(
+            (scratch.as_rows().num_rows(), scratch.as_rows().row(1)),
+            (2, &[5.0; 3][..])
+        );
+        assert!(scratch.rows(usize::MAX, 2).is_err());
+        assert_eq!(scratch.rows(4, 0).unwrap().num_rows(), 4);
     }
 
     #[test]
@@ -111,10 +181,10 @@ mod tests {
 
     #[test]
     fn sizing_stops_when_asked_to() {
-        let (mut buffer, len) = (Activations::new(), TOGETHER + 5);
-        assert!(is_stopped(|| sized(&mut buffer, len).map(drop)));
-        assert!(buffer.is_empty(), "before anything is written");
-        assert_eq!(sized(&mut buffer, len).unwrap().len(), len);
+        let (mut scratch, len) = (Scratch::default(), TOGETHER + 5);
+        assert!(is_stopped(|| scratch.slice(len).map(drop)));
+        assert!(scratch.as_slice().is_empty(), "before anything is written");
+        assert_eq!(scratch.slice(len).unwrap().len(), len);
     }
 
     /// Whether `work` gives up if it is to.

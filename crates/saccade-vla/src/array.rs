@@ -1,5 +1,7 @@
 //! Arrays with their shapes: borrowed, borrowed to be written, and owned. The checks that every argument passes.
 
+use saccade_vla_kernels::Rows;
+
 use crate::error::{Error, Result, problem, show_shape};
 
 /// A C-contiguous array: what the public functions take.
@@ -119,7 +121,7 @@ impl<'a, T> ArrayMut<'a, T> {
 }
 
 /// An array that owns its elements.
-#[derive(Clone, Debug, Default, PartialEq)]
+#[derive(Clone, Debug, PartialEq)]
 pub struct OwnedArray {
     data: Vec<f32>,
     shape: Vec<usize>,
@@ -165,6 +167,11 @@ impl OwnedArray {
         }
     }
 
+    /// The elements as rows of the last axis.
+    pub(crate) fn rows(&self) -> Rows<'_> {
+        Rows::new(&self.data, self.shape.last().copied().unwrap_or(1))
+    }
+
     /// The elements and the size of each axis.
     #[must_use]
     pub fn into_parts(self) -> (Vec<f32>, Vec<usize>) {
@@ -193,13 +200,17 @@ fn check_shape(name: &str, axes: &str, given: &[usize], expected: &[usize]) -> R
     )))
 }
 
-/// Elements that are looked at together: a loop without exits is one that compilers turn into vector code.
-const TOGETHER: usize = 1024;
-
 /// The position of the first NaN or infinity.
 pub(crate) fn first_not_finite(data: &[f32]) -> Option<usize> {
     const EXPONENT: u32 = 0x7f80_0000;
-    let is_bad = |value: &f32| value.to_bits() & EXPONENT == EXPONENT;
+    first_where(data, |value| value.to_bits() & EXPONENT == EXPONENT)
+}
+
+/// Elements that are looked at together: a loop without exits is one that compilers turn into vector code.
+const TOGETHER: usize = 1024;
+
+/// The position of the first element that `is_bad`.
+pub(crate) fn first_where<T>(data: &[T], is_bad: impl Fn(&T) -> bool) -> Option<usize> {
     let chunk = data
         .chunks(TOGETHER)
         .position(|chunk| chunk.iter().fold(false, |bad, value| bad | is_bad(value)))?;

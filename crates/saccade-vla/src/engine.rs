@@ -1,23 +1,30 @@
-//! What computes: the instruction set, the number of threads and the precision.
+//! The engine of a model: instruction set, number of threads and precision.
 
-use saccade_vla_kernels::Isa;
+use std::sync::atomic::{AtomicU64, Ordering};
+
+use saccade_vla_kernels::{Isa, LinearScratch};
 
 use crate::error::{Error, Result, problem};
 use crate::precision::Precision;
 
-/// The most threads that can be asked for: far more than any machine has cores, far fewer than make starting them a problem.
+/// The most threads that can be asked for: far more than any machine has cores, far fewer than make starting them a
+/// problem.
 const MAX_THREADS: usize = 1024;
 
-/// Which instruction set and how many threads the kernels use, and how precisely they compute.
+/// The instruction set, threads and precision that a model computes with.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct Engine {
+#[non_exhaustive]
+pub struct Engine {
+    /// The instruction set that the kernels use.
     pub isa: Isa,
+    /// Threads that a call uses.
     pub threads: usize,
+    /// The arithmetic of each kind of layer.
     pub precision: Precision,
 }
 
 impl Engine {
-    /// What the environment, `precision` and `num_threads` ask for.
+    /// The engine that the environment, `precision` and `num_threads` ask for.
     ///
     /// # Errors
     /// [`Error::Input`] for a number of threads out of range, and for what the environment names but this machine lacks.
@@ -38,4 +45,23 @@ impl Engine {
             precision,
         })
     }
+}
+
+/// The engine that a layer runs on, and the scratch memory of linear layers: they run one after the other, so all of
+/// a call share it.
+pub(crate) struct Kernels<'a> {
+    pub engine: Engine,
+    pub scratch: &'a mut LinearScratch,
+}
+
+impl<'a> Kernels<'a> {
+    pub(crate) fn new(engine: Engine, scratch: &'a mut LinearScratch) -> Self {
+        Self { engine, scratch }
+    }
+}
+
+/// A number that no other model of this process has.
+pub(crate) fn next_id() -> u64 {
+    static NEXT: AtomicU64 = AtomicU64::new(0);
+    NEXT.fetch_add(1, Ordering::Relaxed)
 }

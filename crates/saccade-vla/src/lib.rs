@@ -27,6 +27,7 @@ mod head;
 mod inspect;
 mod nn;
 mod ops;
+mod options;
 mod precision;
 #[cfg(feature = "processor")]
 mod processor;
@@ -44,6 +45,7 @@ pub use backbone::{
     BackboneLoadOptions, BackboneRecord, LanguageConfig, VisionConfig,
 };
 pub use config::HeadConfig;
+pub use engine::Engine;
 pub use error::{Error, ErrorKind, Problem, Result};
 pub use head::action_head::ActionHead;
 pub use head::context::Context;

@@ -1,19 +1,21 @@
-//! Cross-attention on its own: the layer in which state, future and action rows attend to the vision-language tokens.
+//! The cross-attention of the head as a layer of its own, for programs in which everything else runs elsewhere. The
+//! head's blocks do not use it: they are in `head/dit.rs`, on the same [`Attention`].
 
-use std::sync::Mutex;
+use saccade_vla_kernels::{Epilogue, LinearScratch, PackedKeyValues, Rows, RowsMut};
 
-use saccade_vla_kernels::{Activations, Epilogue, LinearScratch, PackedKeyValues};
-
-use crate::alloc::{collected, filled, product};
+use crate::alloc::{Scratch, collected, filled, product};
 use crate::array::{Array, ArrayMut};
-use crate::engine::Engine;
+use crate::engine::{Engine, Kernels};
 use crate::error::{Error, Problem, Result, problem, show_shape};
-use crate::nn::attention::{Attention, AttentionBuffers, Bias, CrossKeys};
+use crate::nn::attention::{Attention, AttentionWorkspace, Bias, CrossKeys};
+use crate::nn::sequences::Sequences;
 use crate::nn::source::memory::{self, MemorySource, TensorViews};
-use crate::nn::source::planner::Planner;
-use crate::nn::weights::{Builder, Source};
+use crate::nn::source::planner::plan;
+use crate::nn::weights::{Builder, Weights};
+use crate::options::setters;
 use crate::precision::Precision;
 use crate::profile::Part;
+use crate::workspaces::Workspaces;
 use saccade_vla_checkpoint::spec;
 
 /// Projected keys and values of a batch: immutable, for any number of calls.
@@ -52,7 +54,7 @@ pub struct CrossAttention {
     num_heads: usize,
     context_dim: usize,
     nbytes: usize,
-    buffers: Mutex<Vec<AttentionBuffers>>,
+    workspaces: Workspaces<(AttentionWorkspace, LinearScratch)>,
 }
 
 /// Which keys count, and how much.
@@ -66,22 +68,11 @@ pub struct KeyOptions<'a> {
 }
 
 impl<'a> KeyOptions<'a> {
-    /// With this mask.
-    #[must_use]
-    pub fn with_key_mask(self, key_mask: impl Into<Option<Array<'a, bool>>>) -> Self {
-        Self {
-            key_mask: key_mask.into(),
-            ..self
-        }
-    }
-
-    /// With this bias.
-    #[must_use]
-    pub fn with_key_bias(self, key_bias: impl Into<Option<Array<'a>>>) -> Self {
-        Self {
-            key_bias: key_bias.into(),
-            ..self
-        }
+    setters! {
+        /// With this mask.
+        with_key_mask(key_mask: impl Into<Option<Array<'a, bool>>>);
+        /// With this bias.
+        with_key_bias(key_bias: impl Into<Option<Array<'a>>>);
     }
 }
 
@@ -107,9 +98,12 @@ impl CrossAttention {
         let context_dim = axes("to_k.weight")
             .and_then(|shape| shape.get(1).copied())
             .unwrap_or(1);
-        let planner = Planner::default();
-        attention(&planner, engine, width, context_dim, 1)?;
-        let problems = memory::problems(tensors, &planner.into_plan().specs, |_, _| false);
+        let layer = |num_heads| {
+            move |weights: &Weights<'_>| {
+                Attention::new(weights, width, context_dim, num_heads, Part::ContextToKv)
+            }
+        };
+        let problems = memory::problems(tensors, &plan(layer(1))?.specs, |_, _| false);
         if !problems.is_empty() {
             let listed = spec::list(&problems, "the widths of to_q and to_k");
             return Err(Error::Checkpoint(Problem::new("tensors", listed)));
@@ -126,14 +120,14 @@ impl CrossAttention {
             )));
         }
         let source = MemorySource::new(tensors);
-        let (attention, nbytes) = attention(&source, engine, width, context_dim, num_heads)?;
+        let (attention, nbytes) = Builder::build(&source, engine, layer(num_heads))?;
         Ok(Self {
             attention,
             nbytes,
             engine,
             num_heads,
             context_dim,
-            buffers: Mutex::new(Vec::new()),
+            workspaces: Workspaces::new(),
         })
     }
 
@@ -149,10 +143,10 @@ impl CrossAttention {
         self.context_dim
     }
 
-    /// What it computes in.
+    /// The instruction set, threads and precision of its calls.
     #[must_use]
-    pub fn precision(&self) -> Precision {
-        self.engine.precision
+    pub fn engine(&self) -> Engine {
+        self.engine
     }
 
     /// Bytes of weights in memory.
@@ -175,11 +169,10 @@ impl CrossAttention {
         let (batch, num_vl_tokens) =
             self.check_rows("encoder_hidden_states", encoder_hidden_states, self.context_dim)?;
         let packed = self.attention.project(
-            self.engine,
-            encoder_hidden_states.data(),
+            &mut Kernels::new(self.engine, &mut LinearScratch::new()),
+            Rows::new(encoder_hidden_states.data(), self.context_dim),
             &filled("keys and values", batch, num_vl_tokens)?,
-            &mut Activations::new(),
-            &mut LinearScratch::new(),
+            &mut Scratch::default(),
         )?;
         Ok(KeyValues {
             batch,
@@ -210,7 +203,7 @@ impl CrossAttention {
         self.check_keys(kv, batch)?;
         let shape = [batch, queries, self.width()];
         let out = out.check_shape("out", "(batch, queries, width)", &shape)?;
-        let weights = match weights {
+        let probabilities = match weights {
             None => None,
             Some(weights) => {
                 let shape = [batch, self.num_heads, queries, kv.num_vl_tokens];
@@ -219,35 +212,23 @@ impl CrossAttention {
         };
         let logit_bias = logit_bias([kv.batch, kv.num_vl_tokens], keys.key_mask, keys.key_bias)?;
         let keys = CrossKeys {
-            packed: &kv.packed,
-            samples: 1,
+            caches: &kv.packed,
             subset: None,
             bias: Bias {
                 keys: logit_bias.as_deref(),
                 shared: None,
             },
+            probabilities,
         };
-        let (y, engine) = (hidden_states.data(), self.engine);
-        self.with_buffers(|buffers| {
-            self.attention.mix_cross(engine, y, keys, weights, buffers)?;
-            self.attention.out(engine, Epilogue::Store, buffers, out)
+        let y = Sequences::new(Rows::new(hidden_states.data(), self.width()), batch);
+        self.workspaces.with(Default::default, |(attention, scratch)| {
+            let kernels = &mut Kernels::new(self.engine, scratch);
+            let out = RowsMut::new(out, self.width());
+            self.attention
+                .cross(kernels, y, keys, attention, Epilogue::Store, out)
         })?;
         let result = Array::new(out, &shape)?.check_result("hidden_states");
         result.map(drop).inspect_err(|_| out.fill(0.0))
-    }
-
-    /// Runs `call` with buffers; never waits for the lock of their list.
-    fn with_buffers(&self, call: impl FnOnce(&mut AttentionBuffers) -> Result<()>) -> Result<()> {
-        let kept = self.buffers.try_lock().ok().and_then(|mut kept| kept.pop());
-        let mut buffers = kept.unwrap_or_else(AttentionBuffers::new);
-        let result = call(&mut buffers);
-        // Those that grew until memory ran out are not kept.
-        if !matches!(result, Err(Error::Memory { .. }))
-            && let Ok(mut kept) = self.buffers.try_lock()
-        {
-            kept.push(buffers);
-        }
-        result
     }
 
     fn check_keys(&self, kv: &KeyValues, batch: usize) -> Result<()> {
@@ -277,20 +258,6 @@ impl CrossAttention {
             ))),
         }
     }
-}
-
-/// The layer from the tensors of `source`, and the bytes that it holds.
-fn attention(
-    source: &dyn Source,
-    engine: Engine,
-    width: usize,
-    context_dim: usize,
-    num_heads: usize,
-) -> Result<(Attention, usize)> {
-    let builder = Builder::new(source, engine);
-    let weights = builder.weights();
-    let layer = Attention::new(&weights, width, context_dim, num_heads, Part::ContextToKv)?;
-    Ok((layer, builder.nbytes()))
 }
 
 /// Mask and bias in one: minus infinity takes a key away.

@@ -6,11 +6,11 @@ use saccade_vla_checkpoint::{Checkpoint, read_text};
 
 use super::config::BackboneConfig;
 use super::json::GivenConfig;
-use super::plan::{nbytes, plan};
 use super::recognise::Recognised;
 use crate::engine::Engine;
 use crate::error::{Error, Problem, Result};
-use crate::nn::source::planner::Plan;
+use crate::nn::source::planner::{Plan, plan};
+use crate::nn::source::sizer::nbytes;
 use crate::precision::Precision;
 
 /// A checkpoint with a backbone, open, whose tensors fit its config.
@@ -35,7 +35,7 @@ impl BackboneCheckpoint {
         };
         let names: Vec<&str> = checkpoint.names().collect();
         let found = Recognised::new(names.iter().copied(), &given)?;
-        let plan = plan(&found)?;
+        let plan = plan(|weights| found.layers(weights))?;
         let is_unused = |name: &str, _: &[usize]| found.is_unused(name);
         let problems = checkpoint.problems(found.prefix, &plan.specs, is_unused);
         if !problems.is_empty() {
@@ -70,7 +70,7 @@ impl BackboneCheckpoint {
 
     pub(super) fn nbytes_in(&self, engine: Engine) -> Result<usize> {
         let dtype = |name: &str| Ok(self.checkpoint.dtype(&format!("{}{name}", self.found.prefix))?);
-        nbytes(&self.found, engine, dtype)
+        nbytes(engine, dtype, |weights| self.found.layers(weights))
     }
 
     /// The tensors that are read, by their names without the prefix.

@@ -1,21 +1,22 @@
 //! Encoding prompts: views through the tower, then the rows of all prompts together through the language model.
 
-use std::ops::Range;
 use std::sync::Arc;
 
-use saccade_vla_kernels::{Epilogue, PackedKeyValues};
+use saccade_vla_kernels::{Epilogue, PackedKeyValues, Rows, RowsMut};
 
 use super::features::{BackboneFeatures, BackboneRecord, EncodedPrompt, View};
 use super::inputs::{BackboneInputs, Checked, Prompt, ViewPixels};
-use super::model::{Backbone, BackboneBuffers};
+use super::model::{Backbone, BackboneWorkspace};
 use super::qwen3::{Additions, NewRows};
 use super::reuse::{longest_prefix, same_view};
-use super::vision::positions::{language_turns, token_positions};
-use crate::alloc::{collected, filled, product, reserve, sized};
+use super::token_positions::{rope_pairs, token_positions};
+use crate::alloc::{collected, filled, product, reserve};
 use crate::array::{Array, OwnedArray};
+use crate::engine::Kernels;
 use crate::error::{Error, Result, problem};
-use crate::nn::rope::Rotation;
-use crate::ops::{first_keys_values, room_for_keys_values};
+use crate::nn::kv_cache;
+use crate::nn::rope::Rope;
+use crate::options::setters;
 
 /// Rows of the language model that are computed together. More read the weights less often; fewer keep the activations small: at 2048 rows
 /// the weights are read once for 7 prompts of one view, and the largest buffer is 50 MB at the released size.
@@ -34,22 +35,13 @@ pub struct BackboneKeep {
 }
 
 impl BackboneKeep {
-    /// With or without the rows after each layer of the language model.
-    #[must_use]
-    pub fn with_hidden(self, hidden: bool) -> Self {
-        Self { hidden, ..self }
-    }
-
-    /// With or without the patches after the vision tower.
-    #[must_use]
-    pub fn with_vision(self, vision: bool) -> Self {
-        Self { vision, ..self }
-    }
-
-    /// With or without the tokens of each view.
-    #[must_use]
-    pub fn with_image_tokens(self, image_tokens: bool) -> Self {
-        Self { image_tokens, ..self }
+    setters! {
+        /// With or without the rows after each layer of the language model.
+        with_hidden(hidden: bool);
+        /// With or without the patches after the vision tower.
+        with_vision(vision: bool);
+        /// With or without the tokens of each view.
+        with_image_tokens(image_tokens: bool);
     }
 }
 
@@ -124,8 +116,8 @@ impl Backbone {
             .iter()
             .map(|inputs| Checked::new(&self.config, inputs))
             .collect::<Result<_>>()?;
-        self.with_buffers(|buffers| {
-            let views = self.views(&checked, previous, keep.vision, buffers)?;
+        self.with_workspace(|workspace| {
+            let views = self.views(&checked, previous, keep.vision, workspace)?;
             let sequences = self.sequences(&checked, views, previous)?;
             let mut results = checked
                 .iter()
@@ -140,7 +132,7 @@ impl Backbone {
                 });
                 let (group, rest) = left.split_at(together.count().max(1));
                 left = rest;
-                let encoded = self.encode_group(group, &mut results, buffers)?;
+                let encoded = self.encode_group(group, &mut results, workspace)?;
                 for (sequence, encoded) in group.iter().zip(encoded) {
                     let [input, _] = sequence.place;
                     let result = &mut results[input];
@@ -158,7 +150,7 @@ impl Backbone {
         inputs: &[Checked<'_>],
         previous: &[&BackboneFeatures],
         record: bool,
-        buffers: &mut BackboneBuffers,
+        workspace: &mut BackboneWorkspace,
     ) -> Result<Vec<Vec<Arc<View>>>> {
         let mut found: Vec<Vec<Option<Arc<View>>>> = Vec::new();
         let mut new: Vec<ViewPixels<'_>> = Vec::new();
@@ -180,9 +172,12 @@ impl Backbone {
             }
             found.push(of_inputs);
         }
-        let vision = &self.layers.vision;
-        let encoded = vision.encode(self.engine, &self.config, &new, record, &mut buffers.vision)?;
-        let mut encoded = encoded.into_iter();
+        let BackboneWorkspace { vision, linear, .. } = workspace;
+        let kernels = &mut Kernels::new(self.engine, linear);
+        let tower = &self.layers.vision;
+        let mut encoded = tower
+            .encode(kernels, &self.config, &new, record, vision)?
+            .into_iter();
         let views = found.into_iter().map(|of_inputs| {
             let one = |view: Option<Arc<View>>| view.or_else(|| encoded.next());
             of_inputs.into_iter().filter_map(one).collect()
@@ -253,71 +248,65 @@ impl Backbone {
         &self,
         group: &[Sequence<'_>],
         results: &mut [BackboneFeatures],
-        buffers: &mut BackboneBuffers,
+        workspace: &mut BackboneWorkspace,
     ) -> Result<Vec<Arc<EncodedPrompt>>> {
-        let width = self.config.language.width;
         let rows: usize = group.iter().map(Sequence::num_rows).sum();
-        let mut keys_values: Vec<Vec<PackedKeyValues>> = Vec::new();
+        let mut caches: Vec<Vec<PackedKeyValues>> = Vec::new();
         let mut positions = Vec::new();
         reserve("positions", &mut positions, rows)?;
         for sequence in group {
             positions.extend_from_slice(&sequence.positions[sequence.first()..]);
-            keys_values.push(match sequence.num_rows() {
+            caches.push(match sequence.num_rows() {
                 0 => Vec::new(),
-                _ => self.keys_values(sequence)?,
+                _ => self.caches(sequence)?,
             });
         }
-        sized(&mut buffers.language.x, rows * width)?;
-        let deepstack = self.embed(group, &mut buffers.language.x)?;
-        let turns = language_turns(&self.config);
-        let rotation = Rotation::new(self.config.language.head_dim, &turns, &positions)?;
+        let BackboneWorkspace { language, linear, .. } = workspace;
+        let deepstack = self.embed(group, language.x.rows(rows, self.config.language.width)?)?;
+        let rope = Rope::new(
+            self.config.language.head_dim,
+            &rope_pairs(&self.config),
+            &positions,
+        )?;
         if rows > 0 {
             let mut prompts: Vec<NewRows<'_>> = group
                 .iter()
-                .zip(&mut keys_values)
+                .zip(&mut caches)
                 .filter(|(sequence, _)| sequence.num_rows() > 0)
-                .map(|(sequence, keys_values)| NewRows {
+                .map(|(sequence, caches)| NewRows {
                     attended: &sequence.prompt.attended[sequence.first()..],
-                    keys_values,
+                    caches,
                 })
                 .collect();
-            let keep = |layer: usize, x: &[f32]| {
-                record_hidden(group, layer, x, width, results);
-                Ok(())
-            };
-            let language = &self.layers.language;
-            language.run(
-                self.engine,
-                &rotation,
-                &mut prompts,
-                &deepstack,
-                &mut buffers.language,
-                keep,
-            )?;
+            let kernels = &mut Kernels::new(self.engine, linear);
+            let record = |layer: usize, x: Rows<'_>| record_hidden(group, layer, x, results);
+            let model = &self.layers.language;
+            model.run(kernels, &rope, &mut prompts, &deepstack, language, record)?;
         }
-        self.collect(group, keys_values, buffers)
+        self.collect(group, caches, workspace)
     }
 
-    /// Keys and values by layer: those of the tokens that are known, with room for all.
-    fn keys_values(&self, sequence: &Sequence<'_>) -> Result<Vec<PackedKeyValues>> {
+    /// The KV cache of each layer: of the tokens that are known, with capacity for all.
+    fn caches(&self, sequence: &Sequence<'_>) -> Result<Vec<PackedKeyValues>> {
         let language = &self.config.language;
         let count = |attended: &[bool]| attended.iter().filter(|attended| **attended).count();
         let capacity = count(&sequence.prompt.attended);
         let known = count(&sequence.prompt.attended[..sequence.first()]);
         (0..language.num_layers)
             .map(|layer| match sequence.known {
-                Some((held, _)) => first_keys_values(&held.keys_values[layer], known, capacity),
+                Some((held, _)) => kv_cache::first(&held.keys_values[layer], known, capacity),
                 None => {
                     let heads = [language.num_kv_heads, language.head_dim];
-                    room_for_keys_values(self.engine, heads, capacity)
+                    kv_cache::with_capacity(self.engine, heads, capacity)
                 }
             })
             .collect()
     }
 
-    /// Writes the tokens of words and views to `x (rows, width)`; what is added to them after the first layers.
-    fn embed<'a>(&self, group: &'a [Sequence<'_>], x: &mut [f32]) -> Result<Vec<Additions<'a>>> {
-        let width = self.config.language.width;
+    /// Writes the tokens of words and views to the rows of `x`; returns the rows that are added to them after the first
+    /// layers.
+    fn embed<'a>(&self, group: &'a [Sequence<'_>], mut x: RowsMut<'_>) -> Result<Vec<Additions<'a>>> {
+        let width = x.num_columns();
         let mut deepstack: Vec<Additions<'a>> = vec![Vec::new(); self.config.vision.deepstack.len()];
         let count = group
             .iter()
@@ -330,22 +319,20 @@ impl Backbone {
         for sequence in group {
             let first = sequence.first();
             for (place, &id) in sequence.prompt.ids.iter().enumerate().skip(first) {
-                let row = (first_row + place - first) * width;
-                self.layers
-                    .embedding
-                    .look_up(id as usize, &mut x[row..row + width]);
+                let row = x.row_mut(first_row + place - first);
+                self.layers.embedding.look_up(id as usize, row);
             }
             let mut places = sequence.prompt.image_tokens.iter();
             for view in &sequence.views {
+                let tokens = Rows::new(&view.tokens, width);
                 for (token, &place) in places.by_ref().take(view.num_tokens).enumerate() {
                     if place < first {
                         continue;
                     }
-                    let row = (first_row + place - first) * width;
-                    let token = token * width..(token + 1) * width;
-                    x[row..row + width].copy_from_slice(&view.tokens[token.clone()]);
+                    let row = first_row + place - first;
+                    x.row_mut(row).copy_from_slice(tokens.row(token));
                     for (additions, rows) in deepstack.iter_mut().zip(&view.deepstack) {
-                        additions.push((row, &rows[token.clone()]));
+                        additions.push((row, Rows::new(rows, width).row(token)));
                     }
                 }
             }
@@ -358,51 +345,41 @@ impl Backbone {
     fn collect(
         &self,
         group: &[Sequence<'_>],
-        keys_values: Vec<Vec<PackedKeyValues>>,
-        buffers: &mut BackboneBuffers,
+        caches: Vec<Vec<PackedKeyValues>>,
+        workspace: &mut BackboneWorkspace,
     ) -> Result<Vec<Arc<EncodedPrompt>>> {
-        let BackboneBuffers {
-            language, projected, ..
-        } = buffers;
-        let dim = self.config.feature_dim();
-        let finished = self
-            .layers
-            .language
-            .finish(self.engine, &language.x, &mut language.y)?;
-        let finished: &[f32] = match &self.layers.projection {
-            Some(layer) => {
-                let projected = sized(projected, finished.len() / self.config.language.width * dim)?;
-                layer.apply(
-                    self.engine,
-                    finished,
-                    Epilogue::Store,
-                    projected,
-                    &mut language.linear,
-                )?;
-                projected
-            }
-            None => finished,
-        };
+        let BackboneWorkspace {
+            language,
+            projected,
+            linear,
+            ..
+        } = workspace;
+        let (model, x) = (&self.layers.language, language.x.as_rows());
+        let mut features = model.finish(self.engine, x, &mut language.y)?;
+        if let Some(layer) = &self.layers.projection {
+            let out = projected.rows(features.num_rows(), layer.out_features())?;
+            let kernels = &mut Kernels::new(self.engine, linear);
+            layer.apply(kernels, features, Epilogue::Store, out)?;
+            features = projected.as_rows();
+        }
         let mut first = 0;
         let mut encoded = Vec::new();
-        for (sequence, keys_values) in group.iter().zip(keys_values) {
+        for (sequence, caches) in group.iter().zip(caches) {
             let rows = first..first + sequence.num_rows();
             first = rows.end;
             encoded.push(match sequence.known {
                 Some((held, _)) if rows.is_empty() => Arc::clone(held),
-                _ => Arc::new(encoded_prompt(sequence, finished, rows, dim, keys_values)?),
+                _ => Arc::new(encoded_prompt(sequence, features.rows(rows), caches)?),
             });
         }
         Ok(encoded)
     }
 }
 
-/// What is held of a prompt whose new features are `rows` of `finished (all rows, dim)`.
+/// A prompt whose new features are the rows of `new`.
 fn encoded_prompt(
     sequence: &Sequence<'_>,
-    finished: &[f32],
-    rows: Range<usize>,
-    dim: usize,
+    new: Rows<'_>,
     keys_values: Vec<PackedKeyValues>,
 ) -> Result<EncodedPrompt> {
     let Prompt {
@@ -411,12 +388,13 @@ fn encoded_prompt(
         image_tokens,
         ..
     } = sequence.prompt;
+    let dim = new.num_columns();
     let mut features = Vec::new();
     reserve("backbone_features", &mut features, ids.len() * dim)?;
     if let Some((held, len)) = sequence.known {
         features.extend_from_slice(&held.features[..len * dim]);
     }
-    features.extend_from_slice(&finished[rows.start * dim..rows.end * dim]);
+    new.iter().for_each(|row| features.extend_from_slice(row));
     Array::new(&features, &[ids.len(), dim])?.check_result("backbone_features")?;
     Ok(EncodedPrompt {
         ids: collected("input_ids", ids.len(), ids.iter().copied())?,
@@ -428,21 +406,17 @@ fn encoded_prompt(
     })
 }
 
-/// Keeps the rows of a group after a layer, where that is asked for.
-fn record_hidden(
-    group: &[Sequence<'_>],
-    layer: usize,
-    x: &[f32],
-    width: usize,
-    results: &mut [BackboneFeatures],
-) {
+/// Records the rows of a group after a layer, where that is asked for.
+fn record_hidden(group: &[Sequence<'_>], layer: usize, x: Rows<'_>, results: &mut [BackboneFeatures]) {
     let mut first = 0;
     for sequence in group {
         let [input, prompt] = sequence.place;
-        let rows = first..first + sequence.num_rows() * width;
+        let rows = first..first + sequence.num_rows();
         first = rows.end;
-        if let Some(kept) = results[input].recorded.hidden.get_mut(layer) {
-            kept.data_mut()[prompt * rows.len()..][..rows.len()].copy_from_slice(&x[rows]);
+        if let Some(recorded) = results[input].recorded.hidden.get_mut(layer) {
+            let tokens = prompt * rows.len()..(prompt + 1) * rows.len();
+            let recorded = RowsMut::new(recorded.data_mut(), x.num_columns());
+            recorded.rows(tokens).copy_from(x.rows(rows));
         }
     }
 }

@@ -6,6 +6,7 @@ use super::config::{BackboneConfig, CHANNELS, Tower, VisionConfig};
 use crate::alloc::{collected, filled, reserve};
 use crate::array::{Array, unravel};
 use crate::error::{Error, Result, problem, show_shape};
+use crate::options::setters;
 
 /// The inputs of [`Backbone::encode`](super::model::Backbone::encode), as the released processors prepare them.
 #[derive(Clone, Debug)]
@@ -34,22 +35,11 @@ impl<'a> BackboneInputs<'a> {
         }
     }
 
-    /// With this mask of padding.
-    #[must_use]
-    pub fn with_attention_mask(self, mask: impl Into<Option<Array<'a, bool>>>) -> Self {
-        Self {
-            attention_mask: mask.into(),
-            ..self
-        }
-    }
-
-    /// With these grids of patches.
-    #[must_use]
-    pub fn with_image_grid_thw(self, grid: impl Into<Option<Array<'a, i64>>>) -> Self {
-        Self {
-            image_grid_thw: grid.into(),
-            ..self
-        }
+    setters! {
+        /// With this mask of padding.
+        with_attention_mask(attention_mask: impl Into<Option<Array<'a, bool>>>);
+        /// With these grids of patches.
+        with_image_grid_thw(image_grid_thw: impl Into<Option<Array<'a, i64>>>);
     }
 }
 

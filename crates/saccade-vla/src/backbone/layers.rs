@@ -2,7 +2,7 @@
 
 use super::config::BackboneConfig;
 use super::qwen3::Qwen3;
-use super::recognise::TensorNames;
+use super::recognise::{Recognised, TensorNames};
 use super::vision::Vision;
 use crate::error::Result;
 use crate::nn::embedding::Embedding;
@@ -24,8 +24,8 @@ impl BackboneLayers {
     /// The layers of a backbone of this config, whose tensors have these names.
     ///
     /// # Errors
-    /// As the source of the weights has them.
-    pub(super) fn new(weights: &Weights<'_>, names: &TensorNames, config: &BackboneConfig) -> Result<Self> {
+    /// Those of the source of the weights.
+    fn new(weights: &Weights<'_>, names: &TensorNames, config: &BackboneConfig) -> Result<Self> {
         let language = &config.language;
         // First, while little else is in memory: it is by far the largest tensor.
         let embedding = Embedding::new(
@@ -45,5 +45,15 @@ impl BackboneLayers {
                 None => None,
             },
         })
+    }
+}
+
+impl Recognised {
+    /// The layers of the backbone.
+    ///
+    /// # Errors
+    /// Those of the source of the weights.
+    pub(super) fn layers(&self, weights: &Weights<'_>) -> Result<BackboneLayers> {
+        BackboneLayers::new(weights, &self.names, &self.config)
     }
 }

@@ -2,20 +2,19 @@
 
 use std::path::Path;
 
-use saccade_vla_checkpoint::granted;
-use saccade_vla_checkpoint::spec::TensorProblem;
+use saccade_vla_checkpoint::probe_allocation;
 
 use super::checkpoint::BackboneCheckpoint;
 use super::json::GivenConfig;
-use super::layers::BackboneLayers;
 use super::model::Backbone;
-use super::plan::plan;
 use super::recognise::Recognised;
 use crate::engine::Engine;
-use crate::error::{Error, Problem, Result};
+use crate::error::Result;
 use crate::nn::source::file::FileSource;
 use crate::nn::source::memory::{self, MemorySource, TensorViews};
+use crate::nn::source::planner::plan;
 use crate::nn::weights::{Builder, Source};
+use crate::options::setters;
 use crate::precision::Precision;
 
 /// How a backbone is loaded.
@@ -37,28 +36,13 @@ pub struct BackboneLoadOptions {
 }
 
 impl BackboneLoadOptions {
-    /// With this config, as JSON.
-    #[must_use]
-    pub fn with_config(self, config: impl Into<Option<String>>) -> Self {
-        Self {
-            config: config.into(),
-            ..self
-        }
-    }
-
-    /// With this precision.
-    #[must_use]
-    pub fn with_precision(self, precision: Precision) -> Self {
-        Self { precision, ..self }
-    }
-
-    /// With this number of threads.
-    #[must_use]
-    pub fn with_num_threads(self, num_threads: impl Into<Option<usize>>) -> Self {
-        Self {
-            num_threads: num_threads.into(),
-            ..self
-        }
+    setters! {
+        /// With this config, as JSON.
+        with_config(config: impl Into<Option<String>>);
+        /// With this precision.
+        with_precision(precision: Precision);
+        /// With this number of threads.
+        with_num_threads(num_threads: impl Into<Option<usize>>);
     }
 }
 
@@ -80,7 +64,7 @@ impl Backbone {
     pub fn load(source: &Path, options: &BackboneLoadOptions) -> Result<Self> {
         let engine = Engine::new(options.precision, options.num_threads)?;
         let published = BackboneCheckpoint::open(source, options.config.as_deref())?;
-        granted("source", published.nbytes_in(engine)?)?;
+        probe_allocation("source", published.nbytes_in(engine)?)?;
         let BackboneCheckpoint {
             checkpoint,
             found,
@@ -102,28 +86,19 @@ impl Backbone {
         let engine = Engine::new(options.precision, options.num_threads)?;
         let given = GivenConfig::parse(options.config.as_deref().unwrap_or("{}"))?;
         let found = Recognised::new(tensors.keys().map(String::as_str), &given)?;
-        let plan = plan(&found)?;
+        let plan = plan(|weights| found.layers(weights))?;
         let own = tensors.iter().filter_map(|(name, tensor)| {
             let name = name.strip_prefix(found.prefix)?.to_owned();
             Some((name, tensor.clone()))
         });
         let own: TensorViews<'_> = own.collect();
         let problems = memory::problems(&own, &plan.specs, |name, _| found.is_unused(name));
-        if !problems.is_empty() {
-            let problem = Problem::new("tensors", found.list(&problems));
-            let is_shape = |problem: &TensorProblem| matches!(problem, TensorProblem::Shape(_));
-            return Err(if problems.iter().all(is_shape) {
-                Error::Shape(problem)
-            } else {
-                Error::Checkpoint(problem)
-            });
-        }
+        memory::check(&problems, |problems| found.list(problems))?;
         Self::build(&MemorySource::new(&own), engine, &found)
     }
 
     fn build(source: &dyn Source, engine: Engine, found: &Recognised) -> Result<Self> {
-        let builder = Builder::new(source, engine);
-        let layers = BackboneLayers::new(&builder.weights(), &found.names, &found.config)?;
-        Ok(Self::new(found.config.clone(), engine, layers, builder.nbytes()))
+        let (layers, nbytes) = Builder::build(source, engine, |weights| found.layers(weights))?;
+        Ok(Self::new(found.config.clone(), engine, layers, nbytes))
     }
 }

@@ -10,11 +10,11 @@ mod json;
 mod layers;
 mod load;
 mod model;
-mod plan;
 mod qwen3;
 mod recognise;
 mod released;
 mod reuse;
+mod token_positions;
 mod vision;
 
 pub use checkpoint::BackboneCheckpoint;

@@ -1,15 +1,14 @@
 //! A loaded backbone: its layers, its config and the memory that its calls share.
 
-use saccade_vla_kernels::{Activations, Isa};
+use saccade_vla_kernels::LinearScratch;
 
 use super::config::BackboneConfig;
 use super::layers::BackboneLayers;
-use super::qwen3::LanguageBuffers;
-use super::vision::buffers::VisionBuffers;
-use crate::engine::Engine;
+use super::qwen3::LanguageWorkspace;
+use super::vision::VisionWorkspace;
+use crate::alloc::Scratch;
+use crate::engine::{Engine, next_id};
 use crate::error::Result;
-use crate::head::action_head::next_id;
-use crate::precision::Precision;
 use crate::workspaces::Workspaces;
 
 /// A loaded vision-language backbone. Immutable; serves any number of threads at once.
@@ -20,16 +19,17 @@ pub struct Backbone {
     pub(super) id: u64,
     pub(super) layers: BackboneLayers,
     nbytes: usize,
-    workspaces: Workspaces<BackboneBuffers>,
+    workspaces: Workspaces<BackboneWorkspace>,
 }
 
-/// Memory of one call, kept for the next call.
+/// Memory kept between calls.
 #[derive(Default)]
-pub(super) struct BackboneBuffers {
-    pub vision: VisionBuffers,
-    pub language: LanguageBuffers,
+pub(super) struct BackboneWorkspace {
+    pub vision: VisionWorkspace,
+    pub language: LanguageWorkspace,
     /// Features where a last layer changes their width.
-    pub projected: Activations,
+    pub projected: Scratch,
+    pub linear: LinearScratch,
 }
 
 impl Backbone {
@@ -51,22 +51,10 @@ impl Backbone {
         &self.config
     }
 
-    /// Threads that a call uses.
+    /// The instruction set, threads and precision of its calls.
     #[must_use]
-    pub fn num_threads(&self) -> usize {
-        self.engine.threads
-    }
-
-    /// What it computes in.
-    #[must_use]
-    pub fn precision(&self) -> Precision {
-        self.engine.precision
-    }
-
-    /// The instruction set that the kernels use.
-    #[must_use]
-    pub fn isa(&self) -> Isa {
-        self.engine.isa
+    pub fn engine(&self) -> Engine {
+        self.engine
     }
 
     /// Bytes of weights in memory.
@@ -75,7 +63,11 @@ impl Backbone {
         self.nbytes
     }
 
-    pub(super) fn with_buffers<R>(&self, call: impl FnOnce(&mut BackboneBuffers) -> Result<R>) -> Result<R> {
-        self.workspaces.with(BackboneBuffers::default, call)
+    /// Runs `call` with a workspace.
+    pub(super) fn with_workspace<R>(
+        &self,
+        call: impl FnOnce(&mut BackboneWorkspace) -> Result<R>,
+    ) -> Result<R> {
+        self.workspaces.with(BackboneWorkspace::default, call)
     }
 }

@@ -1,17 +1,17 @@
 //! Qwen3, the language model: the layers that are kept, over the tokens of words and views.
 
-use saccade_vla_kernels::{Activations, Epilogue, LinearScratch, PackedKeyValues};
+use saccade_vla_kernels::{Epilogue, PackedKeyValues, Rows};
 
 use super::config::LanguageConfig;
-use crate::alloc::sized;
-use crate::engine::Engine;
+use crate::alloc::Scratch;
+use crate::engine::{Engine, Kernels};
 use crate::error::Result;
-use crate::nn::gated_mlp::GatedMlp;
+use crate::nn::feed_forward::FeedForward;
 use crate::nn::grouped_attention::{
-    Causal, GroupedAttention, GroupedBuffers, GroupedSizes, Projections, Qkv, Sequences,
+    Attended, Causal, GroupedAttention, GroupedSizes, GroupedWorkspace, Projections, Qkv,
 };
-use crate::nn::rms_norm::RmsNorm;
-use crate::nn::rope::Rotation;
+use crate::nn::norm::RmsNorm;
+use crate::nn::rope::Rope;
 use crate::nn::weights::Weights;
 use crate::ops::check_interrupted;
 
@@ -33,28 +33,28 @@ struct Layer {
     input_layernorm: RmsNorm,
     attention: GroupedAttention,
     post_attention_layernorm: RmsNorm,
-    mlp: GatedMlp,
+    mlp: FeedForward,
 }
 
 /// The rows of a prompt that are computed.
 pub(super) struct NewRows<'a> {
     /// For each of them whether it may be attended to.
     pub attended: &'a [bool],
-    /// By layer, the keys and values of earlier rows; those of these rows are added.
-    pub keys_values: &'a mut [PackedKeyValues],
+    /// By layer, the KV cache of earlier rows; keys and values of these rows are appended.
+    pub caches: &'a mut [PackedKeyValues],
 }
 
-/// Rows that are added to the hidden state after a layer: first row, and the rows.
+/// Rows that are added to the hidden state after a layer, each with the number of the row that it is added to.
 pub(super) type Additions<'a> = Vec<(usize, &'a [f32])>;
 
-/// Memory of one call that is kept for the next.
+/// Memory kept between calls.
 #[derive(Default)]
-pub(super) struct LanguageBuffers {
-    pub x: Activations,
-    pub y: Activations,
-    hidden: Activations,
-    attention: GroupedBuffers,
-    pub linear: LinearScratch,
+pub(super) struct LanguageWorkspace {
+    /// The residual stream, `(rows, width)`.
+    pub x: Scratch,
+    pub y: Scratch,
+    hidden: Scratch,
+    attention: GroupedWorkspace,
 }
 
 impl Layer {
@@ -67,12 +67,11 @@ impl Layer {
             head_dim: config.head_dim,
         };
         let norm = |name: &str| RmsNorm::new(&weights.at(name), width, eps);
-        let mlp = weights.at("mlp");
         Ok(Self {
             input_layernorm: norm("input_layernorm")?,
             attention: GroupedAttention::new(&weights.at("self_attn"), sizes, PROJECTIONS, Some(eps))?,
             post_attention_layernorm: norm("post_attention_layernorm")?,
-            mlp: GatedMlp::new(&mlp, width, config.hidden_dim, Epilogue::Silu, false)?,
+            mlp: FeedForward::gated(&weights.at("mlp"), [width, config.hidden_dim], Epilogue::Silu)?,
         })
     }
 }
@@ -97,63 +96,65 @@ impl Qwen3 {
         })
     }
 
-    /// Runs the layers over the rows of all prompts, which are in `buffers.x (rows, width)`. `deepstack` is what is added after the first
-    /// layers; `keep` is given the rows after each layer, before that.
+    /// Runs the layers over the rows of all prompts, which are in `workspace.x`. `deepstack` is added after the first
+    /// layers; `record` is given the rows after each layer, before that.
     pub(super) fn run(
         &self,
-        engine: Engine,
-        rotation: &Rotation,
+        kernels: &mut Kernels<'_>,
+        rope: &Rope,
         prompts: &mut [NewRows<'_>],
         deepstack: &[Additions<'_>],
-        buffers: &mut LanguageBuffers,
-        mut keep: impl FnMut(usize, &[f32]) -> Result<()>,
+        workspace: &mut LanguageWorkspace,
+        mut record: impl FnMut(usize, Rows<'_>),
     ) -> Result<()> {
-        let LanguageBuffers {
+        let LanguageWorkspace {
             x,
             y,
             hidden,
             attention,
-            linear,
-        } = buffers;
-        let y = sized(y, x.len())?;
+        } = workspace;
+        let mut x = x.as_rows_mut();
+        let mut y = y.rows(x.num_rows(), x.num_columns())?;
         for (index, layer) in self.layers.iter().enumerate() {
             check_interrupted()?;
-            layer.input_layernorm.apply(engine, x, y)?;
+            layer
+                .input_layernorm
+                .apply(kernels.engine, x.as_rows(), y.reborrow())?;
             let mut sequences: Vec<Causal<'_>> = prompts
                 .iter_mut()
                 .map(|prompt| Causal {
-                    held: &mut prompt.keys_values[index],
+                    cache: &mut prompt.caches[index],
                     attended: prompt.attended,
                 })
                 .collect();
-            let memory = (&mut *attention, &mut *linear);
-            let sequences = Sequences::Causal(&mut sequences);
+            let sequences = Attended::Causal(&mut sequences);
+            layer.attention.add(
+                kernels,
+                y.as_rows(),
+                Some(rope),
+                sequences,
+                attention,
+                x.reborrow(),
+            )?;
             layer
-                .attention
-                .add(engine, y, Some(rotation), sequences, memory, x)?;
-            layer.post_attention_layernorm.apply(engine, x, y)?;
-            layer.mlp.add(engine, y, hidden, linear, x)?;
-            keep(index, x)?;
-            for (first, rows) in deepstack.get(index).into_iter().flatten() {
-                let to = &mut x[*first..first + rows.len()];
-                to.iter_mut().zip(*rows).for_each(|(to, row)| *to += row);
+                .post_attention_layernorm
+                .apply(kernels.engine, x.as_rows(), y.reborrow())?;
+            layer.mlp.add(kernels, y.as_rows(), hidden, x.reborrow())?;
+            record(index, x.as_rows());
+            for (row, added) in deepstack.get(index).into_iter().flatten() {
+                let x = x.row_mut(*row).iter_mut().zip(*added);
+                x.for_each(|(x, added)| *x += added);
             }
         }
         Ok(())
     }
 
     /// The rows `x` after the last norm, if there is one, in `y`.
-    pub(super) fn finish<'a>(
-        &self,
-        engine: Engine,
-        x: &'a [f32],
-        y: &'a mut Activations,
-    ) -> Result<&'a [f32]> {
+    pub(super) fn finish<'a>(&self, engine: Engine, x: Rows<'a>, y: &'a mut Scratch) -> Result<Rows<'a>> {
         let Some(norm) = &self.norm else {
             return Ok(x);
         };
-        let y = sized(y, x.len())?;
-        norm.apply(engine, x, y)?;
-        Ok(y)
+        norm.apply(engine, x, y.rows(x.num_rows(), x.num_columns())?)?;
+        Ok(y.as_rows())
     }
 }

@@ -1,31 +1,34 @@
-//! Action rows from noisy actions and the time (spec 1.3), with the first two layers taken apart (spec I12).
+//! Action rows from noisy actions and the timestep: `W3 silu(W2 [W1 x; tau]) + position` with the first two layers merged.
 
 use std::sync::Arc;
 
 use faer::linalg::matmul::matmul;
 use faer::{Accum, Mat, MatRef, Par};
-use saccade_vla_kernels::{Activations, Epilogue, LinearScratch, Matrix, WeightRef, silu};
+use saccade_vla_kernels::{Epilogue, LinearScratch, Matrix, Rows, RowsMut, WeightRef, silu};
 
 use super::cache::Cache;
 use super::embodiment_layers::EmbodimentLinear;
 use super::embodiments::Embodiments;
-use crate::alloc::sized;
+use crate::alloc::Scratch;
+use crate::array::OwnedArray;
 use crate::config::HeadConfig;
-use crate::engine::Engine;
+use crate::engine::{Engine, Kernels};
 use crate::error::Result;
 use crate::nn::linear::Linear;
+use crate::nn::sequences::Sequences;
 use crate::nn::weights::{Outline, Stored, Weight, Weights};
 use crate::ops::check_interrupted;
 use crate::precision::Role;
 use crate::sampling::timestep_embedding::action_encoder_embedding;
 
-/// Brackets of the action encoder that are kept, one for each embodiment and bucket; 1.6 MB at N1.5's size.
-pub(super) const CACHED_BRACKETS: usize = 256;
+/// Time biases that are cached, one for each embodiment and timestep; 1.6 MB at N1.5's size.
+pub(super) const CACHED_TIME_BIASES: usize = 256;
 
-/// `W3(silu(W2([W1(x); tau]))) + position`, as the released layers compute.
+/// `W3(silu(W2([W1(x); tau]))) + position`, as the released layers compute, for the sinusoidal embedding `tau` of the
+/// timestep.
 ///
-/// The action half of `W2([W1(x); tau])` is linear in `x` and becomes one small layer; the time half, with everything constant added to it,
-/// depends on embodiment and bucket only: the bracket.
+/// The action half of `W2([W1(x); tau])` is linear in `x` and becomes one small layer. The time half, with everything
+/// constant added to it, depends on embodiment and timestep only: the time bias.
 pub(crate) struct ActionEncoder {
     /// `W1 W2[0:width]`, without bias: `(encoder_action_dim -> width)`.
     action: EmbodimentLinear,
@@ -34,17 +37,9 @@ pub(crate) struct ActionEncoder {
     /// `W3`.
     out: EmbodimentLinear,
     /// Its first `action_horizon` rows, `(action_horizon, width)`; none without `add_pos_embed`.
-    position_embedding: Option<Vec<f32>>,
+    position_embedding: Option<OwnedArray>,
     width: usize,
-    brackets: Cache<(usize, usize), Vec<f32>>,
-}
-
-/// Noisy actions, and the conditions under which they are encoded.
-pub(crate) struct NoisyRows<'a> {
-    /// By batch element.
-    pub embodiment_ids: &'a [usize],
-    /// `(batch, samples, action_horizon, encoder_action_dim)`.
-    pub x: &'a [f32],
+    time_biases: Cache<(usize, usize), Vec<f32>>,
 }
 
 impl ActionEncoder {
@@ -53,11 +48,11 @@ impl ActionEncoder {
         weights: &Weights<'_>,
         embodiments: Embodiments<'_>,
         config: &HeadConfig,
-        position_embedding: Option<Vec<f32>>,
+        position_embedding: Option<OwnedArray>,
     ) -> Result<Self> {
         let (width, actions) = (config.width, config.encoder_action_dim);
         let mut time = Vec::with_capacity(embodiments.ids.len());
-        let action = EmbodimentLinear::of(embodiments, actions, width, |id| {
+        let action = EmbodimentLinear::of(embodiments, |id| {
             let [action, of_time] = apart(weights, embodiments, id, actions, width)?;
             time.push(of_time);
             Ok(action)
@@ -65,71 +60,77 @@ impl ActionEncoder {
         let mut time = time.into_iter();
         Ok(Self {
             action,
-            time: EmbodimentLinear::of(embodiments, width, width, |_| {
+            time: EmbodimentLinear::of(embodiments, |_| {
                 Ok(time.next().expect("one per loaded embodiment"))
             })?,
             out: EmbodimentLinear::new(&weights.at("W3"), embodiments, width, width)?,
             position_embedding,
             width,
-            brackets: Cache::new(CACHED_BRACKETS),
+            time_biases: Cache::new(CACHED_TIME_BIASES),
         })
     }
 
-    /// Action rows to `encoded (batch, samples, action_horizon, width)`. `bucket` gives the bucket of a batch element.
+    /// Action rows, `(batch * samples * action_horizon, width)`, to `encoded`, for noisy actions
+    /// `x (batch * samples * action_horizon, encoder_action_dim)` of observations of these embodiments. `timestep` gives
+    /// the timestep of an observation.
     pub(crate) fn encode(
         &self,
-        engine: Engine,
-        noisy: &NoisyRows<'_>,
-        bucket: impl Fn(usize) -> usize,
-        tokens: &mut Activations,
-        encoded: &mut Activations,
-        scratch: &mut LinearScratch,
+        kernels: &mut Kernels<'_>,
+        embodiment_ids: &[usize],
+        x: Rows<'_>,
+        timestep: impl Fn(usize) -> usize,
+        hidden: &mut Scratch,
+        encoded: &mut Scratch,
     ) -> Result<()> {
-        let NoisyRows { embodiment_ids, x } = *noisy;
-        let rows = x.len() / self.action.in_features();
-        let tokens = sized(tokens, rows * self.width)?; // (batch, samples, action_horizon, width)
-        let element = tokens.len() / embodiment_ids.len();
-        for (index, (rows, &id)) in tokens.chunks_exact_mut(element).zip(embodiment_ids).enumerate() {
-            let bracket = self.bracket(engine, id, bucket(index))?;
-            rows.chunks_exact_mut(self.width)
-                .for_each(|row| row.copy_from_slice(&bracket));
+        let observations = Sequences::new(x, embodiment_ids.len());
+        let mut rows = hidden.rows(x.num_rows(), self.width)?;
+        for (index, &id) in embodiment_ids.iter().enumerate() {
+            let bias = self.time_bias(kernels.engine, id, timestep(index))?;
+            let mut rows = rows.reborrow().rows(observations.range(index..index + 1));
+            rows.iter_mut().for_each(|row| row.copy_from_slice(&bias));
         }
         self.action
-            .apply(engine, embodiment_ids, x, Epilogue::Add, tokens, scratch)?;
-        silu(engine.isa, tokens);
-        let encoded = sized(encoded, tokens.len())?;
-        self.out
-            .apply(engine, embodiment_ids, tokens, Epilogue::Store, encoded, scratch)?;
+            .apply(kernels, embodiment_ids, x, Epilogue::Add, rows)?;
+        silu(kernels.engine.isa, hidden.as_mut_slice());
+        let mut encoded = encoded.rows(x.num_rows(), self.width)?;
+        self.out.apply(
+            kernels,
+            embodiment_ids,
+            hidden.as_rows(),
+            Epilogue::Store,
+            encoded.reborrow(),
+        )?;
         if let Some(positions) = &self.position_embedding {
-            for chunk in encoded.chunks_exact_mut(positions.len()) {
-                for (value, position) in chunk.iter_mut().zip(positions) {
-                    *value += position;
-                }
+            let positions = positions.rows();
+            for (index, row) in encoded.iter_mut().enumerate() {
+                let position = positions.row(index % positions.num_rows());
+                row.iter_mut()
+                    .zip(position)
+                    .for_each(|(value, position)| *value += position);
             }
         }
         Ok(())
     }
 
-    /// The part that depends on embodiment and bucket only, `(width)`.
-    pub(crate) fn bracket(
+    /// The part of the first two layers that depends on embodiment and timestep only, `(width)`.
+    pub(crate) fn time_bias(
         &self,
         engine: Engine,
         embodiment_id: usize,
-        bucket: usize,
+        timestep: usize,
     ) -> Result<Arc<Vec<f32>>> {
-        self.brackets.get_or_insert((embodiment_id, bucket), || {
+        self.time_biases.get_or_insert((embodiment_id, timestep), || {
             let mut tau = vec![0.0; self.width];
-            action_encoder_embedding(bucket, &mut tau);
-            let mut bracket = vec![0.0; self.width];
+            action_encoder_embedding(timestep, &mut tau);
+            let mut bias = vec![0.0; self.width];
             self.time.apply(
-                engine,
+                &mut Kernels::new(engine, &mut LinearScratch::new()),
                 &[embodiment_id],
-                &tau,
+                Rows::new(&tau, self.width),
                 Epilogue::Store,
-                &mut bracket,
-                &mut LinearScratch::new(),
+                RowsMut::new(&mut bias, self.width),
             )?;
-            Ok(bracket)
+            Ok(bias)
         })
     }
 }

@@ -1,17 +1,12 @@
 //! A loaded head: its layers, its config and the memory that its calls share.
 
-use std::sync::atomic::{AtomicU64, Ordering};
-
-use saccade_vla_kernels::Isa;
-
 use super::layers::HeadLayers;
 use super::state_dropout::StateDropout;
 use super::workspace::Workspace;
 use crate::array::Array;
 use crate::config::{HeadConfig, Reads};
-use crate::engine::Engine;
+use crate::engine::{Engine, next_id};
 use crate::error::Result;
-use crate::precision::Precision;
 use crate::workspaces::Workspaces;
 
 /// A loaded action head. Immutable; serves any number of threads at once.
@@ -71,22 +66,10 @@ impl ActionHead {
         self.layers.future_tokens.view()
     }
 
-    /// Threads that a call uses.
+    /// The instruction set, threads and precision of its calls.
     #[must_use]
-    pub fn num_threads(&self) -> usize {
-        self.engine.threads
-    }
-
-    /// What it computes in.
-    #[must_use]
-    pub fn precision(&self) -> Precision {
-        self.engine.precision
-    }
-
-    /// The instruction set that the kernels use.
-    #[must_use]
-    pub fn isa(&self) -> Isa {
-        self.engine.isa
+    pub fn engine(&self) -> Engine {
+        self.engine
     }
 
     /// Bytes of weights in memory.
@@ -108,12 +91,6 @@ impl ActionHead {
 
     /// Runs `call` with a workspace.
     pub(super) fn with_workspace<R>(&self, call: impl FnOnce(&mut Workspace) -> Result<R>) -> Result<R> {
-        self.workspaces.with(Workspace::new, call)
+        self.workspaces.with(Workspace::default, call)
     }
-}
-
-/// A number that no other model of this process has.
-pub(crate) fn next_id() -> u64 {
-    static NEXT: AtomicU64 = AtomicU64::new(0);
-    NEXT.fetch_add(1, Ordering::Relaxed)
 }

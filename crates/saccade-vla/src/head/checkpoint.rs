@@ -1,4 +1,4 @@
-//! What a checkpoint is to a head that is not loaded: whether its tensors fit, and how many bytes of weights the head would hold.
+//! A checkpoint of a head that is not loaded: the check of its tensors, and the bytes of weights that the head would hold.
 
 use saccade_vla_checkpoint::spec;
 
@@ -7,8 +7,7 @@ use super::layers::HeadLayers;
 use super::plan::{is_unused, specs_of};
 use crate::engine::Engine;
 use crate::error::{Error, Problem, Result};
-use crate::nn::source::sizer::Sizer;
-use crate::nn::weights::Builder;
+use crate::nn::source::sizer::nbytes;
 use crate::precision::Precision;
 use crate::recognise::HeadCheckpoint;
 
@@ -34,21 +33,21 @@ impl HeadCheckpoint {
         self.checkpoint.shape(&format!("{}{name}", self.prefix)).is_some()
     }
 
-    /// What [`ActionHead::nbytes`](crate::ActionHead::nbytes) would be with this number of embodiments.
+    /// [`ActionHead::nbytes`](crate::ActionHead::nbytes) of a head with this number of embodiments.
     ///
     /// # Errors
-    /// [`Error::Isa`] for an unknown instruction set in the environment; [`Error::Checkpoint`] and [`Error::Packing`] for a tensor that is not there or has too many inputs for int8.
+    /// [`Error::Isa`] for an unknown instruction set in the environment; [`Error::Checkpoint`] and [`Error::Packing`] for
+    /// a tensor that is not there or has too many inputs for int8.
     pub fn nbytes(&self, precision: Precision, num_embodiments: usize) -> Result<usize> {
         let engine = Engine::new(precision, Some(1))?;
         let dtype = |name: &str| Ok(self.checkpoint.dtype(&format!("{}{name}", self.prefix))?);
-        let sizer = Sizer::new(engine, dtype);
-        let builder = Builder::new(&sizer, engine);
         let ids: Vec<usize> = (0..num_embodiments).collect();
         let embodiments = Embodiments {
             ids: &ids,
             count: self.config.num_embodiments.max(num_embodiments),
         };
-        HeadLayers::new(&builder.weights(), &self.config, embodiments)?;
-        Ok(builder.nbytes())
+        nbytes(engine, dtype, |weights| {
+            HeadLayers::new(weights, &self.config, embodiments)
+        })
     }
 }

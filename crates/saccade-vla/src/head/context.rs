@@ -1,10 +1,10 @@
-//! What is computed once per observation and held: the vision-language tokens, and the keys and values of every cross-attention block.
+//! An encoded observation: the vision-language tokens, and the KV cache of every cross-attention block.
 
 use std::ops::Range;
 
-use saccade_vla_kernels::{Activations, PackedKeyValues};
+use saccade_vla_kernels::{PackedKeyValues, Rows};
 
-use crate::alloc::sized;
+use crate::alloc::Scratch;
 use crate::config::Reads;
 use crate::error::Result;
 use crate::inspect::trace::Recorded;
@@ -15,7 +15,8 @@ pub struct Context {
     pub(crate) batch: usize,
     pub(crate) num_vl_tokens: usize,
     pub(crate) vl_embs: Vec<f32>,
-    /// Keys and values by block, and within a block by batch element, of the positions that the block sees. Empty for self-attention.
+    /// KV caches by block, and within a block by observation, of the positions that the block sees. Empty for
+    /// self-attention.
     pub(crate) keys_values: Vec<Vec<PackedKeyValues>>,
     /// One for each kind of cross-attention block.
     pub(crate) seen: Vec<Seen>,
@@ -67,7 +68,7 @@ impl Context {
         4 * self.vl_embs.len() + keys_values + seen + self.image_mask.as_ref().map_or(0, Vec::len)
     }
 
-    /// The positions that blocks of this kind see, by batch element; none if they see all.
+    /// The positions that blocks of this kind see, by observation; none if they see all.
     pub(crate) fn positions(&self, reads: Reads) -> Option<&[Vec<usize>]> {
         let seen = self.seen.iter().find(|seen| seen.reads == reads)?;
         seen.positions.as_deref()
@@ -77,40 +78,42 @@ impl Context {
 /// The vision-language tokens that one kind of cross-attention block sees.
 pub(crate) struct Seen {
     pub reads: Reads,
-    /// Ascending, by batch element; none if all are seen.
+    /// Ascending, by observation; none if all are seen.
     pub positions: Option<Vec<Vec<usize>>>,
 }
 
 impl Seen {
-    /// How many are seen in each of these batch elements.
-    pub(crate) fn counts(&self, elements: Range<usize>, num_vl_tokens: usize) -> Vec<usize> {
+    /// The number of tokens seen of each of these observations.
+    pub(crate) fn counts(&self, observations: Range<usize>, num_vl_tokens: usize) -> Vec<usize> {
         match &self.positions {
-            None => vec![num_vl_tokens; elements.len()],
-            Some(positions) => positions[elements].iter().map(Vec::len).collect(),
+            None => vec![num_vl_tokens; observations.len()],
+            Some(positions) => positions[observations].iter().map(Vec::len).collect(),
         }
     }
 
-    /// The rows of these batch elements that are seen, one element's after the other's; `gathered` is memory for them.
+    /// The rows that are seen of these observations, whose tokens are `vl`, one observation after the other; `gathered` is
+    /// memory for them.
     pub(crate) fn rows<'a>(
         &self,
-        elements: Range<usize>,
-        vl: &'a [f32],
-        context_dim: usize,
-        gathered: &'a mut Activations,
-    ) -> Result<&'a [f32]> {
+        observations: Range<usize>,
+        vl: Rows<'a>,
+        gathered: &'a mut Scratch,
+    ) -> Result<Rows<'a>> {
         let Some(positions) = &self.positions else {
             return Ok(vl);
         };
-        let rows: usize = positions[elements.clone()].iter().map(Vec::len).sum();
-        let gathered = sized(gathered, rows * context_dim)?;
-        let mut rows = gathered.chunks_exact_mut(context_dim);
-        let element = vl.len() / elements.len();
-        for (vl, positions) in vl.chunks_exact(element).zip(&positions[elements]) {
-            for (&position, row) in positions.iter().zip(&mut rows) {
-                row.copy_from_slice(&vl[position * context_dim..][..context_dim]);
-            }
+        let positions = &positions[observations];
+        let num_vl_tokens = vl.num_rows() / positions.len();
+        let count = positions.iter().map(Vec::len).sum();
+        let mut rows = gathered.rows(count, vl.num_columns())?;
+        let tokens = positions.iter().enumerate().flat_map(|(observation, positions)| {
+            let first = observation * num_vl_tokens;
+            positions.iter().map(move |position| first + position)
+        });
+        for (row, token) in rows.iter_mut().zip(tokens) {
+            row.copy_from_slice(vl.row(token));
         }
-        Ok(gathered)
+        Ok(gathered.as_rows())
     }
 
     fn nbytes(&self) -> usize {

@@ -1,23 +1,26 @@
-//! The diffusion transformer (spec 1.4, 1.6, 1.7), one forward pass over the rows `[state, future, action]`.
+//! The diffusion transformer: one forward pass over the rows `[state, future, action]` (flow matching,
+//! docs/equations.md).
 
 use std::sync::Arc;
 
-use saccade_vla_kernels::{Activations, Epilogue, LinearScratch, PackedKeyValues};
+use saccade_vla_kernels::{Epilogue, LinearScratch, PackedKeyValues, Rows, RowsMut};
 
 use super::cache::Cache;
 use super::context::Context;
-use crate::alloc::sized;
+use crate::alloc::Scratch;
 use crate::config::{HeadConfig, Reads};
-use crate::engine::Engine;
+use crate::engine::{Engine, Kernels};
 use crate::error::{Error, Result};
 use crate::inspect::changes::Changes;
 use crate::inspect::groups::{Group, Groups};
 use crate::inspect::trace::{Recorded, StepBlock};
-use crate::nn::attention::{Attention, AttentionBuffers, Bias, CrossKeys, Held, SelfKeys, Subset};
+use crate::nn::attention::{Attention, AttentionWorkspace, Bias, CrossKeys, Held, SelfKeys, Subset};
 use crate::nn::feed_forward::{DIFFUSERS, FeedForward};
 use crate::nn::linear::Linear;
+use crate::nn::norm::layer_norm;
+use crate::nn::sequences::Sequences;
 use crate::nn::weights::Weights;
-use crate::ops::{self, check_interrupted};
+use crate::ops::check_interrupted;
 use crate::precision::Role;
 use crate::profile::Part;
 use crate::sampling::timestep_embedding::{TIME_CHANNELS, transformer_embedding};
@@ -25,8 +28,8 @@ use crate::sampling::timestep_embedding::{TIME_CHANNELS, transformer_embedding};
 const BLOCK_EPS: f32 = 1e-5;
 const OUTPUT_EPS: f32 = 1e-6;
 
-/// Buckets whose modulations are kept: the 4 of the released sampler several times over; 13 MB at N1.5's size.
-const CACHED_BUCKETS: usize = 64;
+/// Timesteps whose modulations are cached: the 4 of the released sampler several times over; 13 MB at N1.5's size.
+const CACHED_TIMESTEPS: usize = 64;
 
 pub(crate) struct Dit {
     timestep_embedder: [Linear; 2],
@@ -39,59 +42,61 @@ pub(crate) struct Dit {
     times: Cache<usize, TimeModulations>,
 }
 
-/// `x += attention(modulated_norm(x)); x += ff(norm(x))`.
+/// `x += attention(adaptive_norm(x)); x += ff(norm(x))`.
 struct Block {
     /// `norm1.linear`.
     modulation: Linear,
     attention: Attention,
-    /// What it sees of the vision-language tokens; none if it is self-attention.
+    /// The vision-language tokens that it attends to; none if it is self-attention.
     reads: Option<Reads>,
     feed_forward: FeedForward,
 }
 
-/// `norm(h) * scale + shift`; the 1 of the released `1 + scale` is in `scale`.
+/// An adaptive norm's `norm(h) * scale + shift`; the 1 of the released `1 + scale` is in `scale`.
 struct Modulation {
     scale: Vec<f32>,
     shift: Vec<f32>,
 }
 
-/// All that depends on the bucket alone (spec I11).
+/// All values that depend on the timestep alone.
 pub(crate) struct TimeModulations {
     blocks: Vec<Modulation>,
     output: Modulation,
 }
 
-/// One forward pass: what it is over, and what is changed in it.
+/// One forward pass: the rows it is over, and the changes made in it.
 #[derive(Clone, Copy)]
 pub(crate) struct Pass<'a> {
     pub context: &'a Context,
-    /// Sequences for each batch element, with equally many rows.
+    /// Sequences for each observation, with equally many rows.
     pub samples: usize,
-    /// Which rows there are, and what is changed at Euler step `step`.
+    /// The rows that there are, and the changes by Euler step.
     pub changes: &'a Changes<'a>,
     pub step: usize,
     pub rows: ActiveRows,
 }
 
-/// Which rows run.
+/// The rows that run.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum ActiveRows {
-    /// All in every block: what a trace shows.
+    /// All in every block, as a trace shows them.
     All,
-    /// All, but in the last block only those of the actions, since nothing reads the others after it (spec I4).
+    /// All, but in the last block only those of the actions, since nothing reads the others after it.
     Needed,
-    /// As [`Self::Needed`], and what the self-attention blocks read of them is held.
+    /// As [`Self::Needed`], and the KV caches of the self-attention blocks are held.
     NeededAndHeld,
-    /// The action rows. The self-attention blocks read the held keys and values of the other rows.
+    /// The action rows. The self-attention blocks read the keys and values of the other rows from the held KV caches.
     Actions,
 }
 
 /// One block in one pass.
 #[derive(Clone, Copy)]
 struct BlockCall<'a> {
-    engine: Engine,
     pass: &'a Pass<'a>,
+    times: &'a [Arc<TimeModulations>],
     index: usize,
+    /// The first row of each sequence that runs.
+    first_row: usize,
 }
 
 impl BlockCall<'_> {
@@ -100,46 +105,33 @@ impl BlockCall<'_> {
         self.pass.context.batch * self.pass.samples
     }
 
-    /// The first row of a sequence that is in `x`, whose rows are `width` wide.
-    fn first_row(&self, x: &[f32], width: usize) -> usize {
-        self.pass.changes.extent.groups.num_rows() - x.len() / width / self.sequences()
-    }
-
-    /// The key of what is recorded.
+    /// The key of a recording.
     fn step_block(&self) -> StepBlock {
         (self.pass.step, self.index)
     }
 }
 
-/// Memory of one pass that is kept for the next.
-pub(crate) struct DitBuffers {
-    /// The residual stream, `(sequences, rows, width)`: filled by the caller, unless only the action rows run.
-    pub h: Activations,
-    /// That of the action rows alone, `(sequences, action_rows, width)`: filled by the caller where only they run.
-    pub action: Activations,
-    /// One for each batch element: filled by the caller.
+/// The input of a pass, of which the residual stream is changed in place. Kept between calls.
+#[derive(Default)]
+pub(crate) struct DitInput {
+    /// The residual stream, `(sequences * rows, width)`, unless only the action rows run.
+    pub h: Scratch,
+    /// That of the action rows alone, `(sequences * action_rows, width)`, where only they run.
+    pub action: Scratch,
+    /// By observation.
     pub times: Vec<Arc<TimeModulations>>,
-    y: Activations,
-    y_all: Activations,
-    hidden: Activations,
-    attention: AttentionBuffers,
-    /// Keys and values by block; empty for cross-attention.
-    held: Vec<Vec<PackedKeyValues>>,
 }
 
-impl DitBuffers {
-    pub(crate) fn new() -> Self {
-        Self {
-            h: Activations::new(),
-            action: Activations::new(),
-            times: Vec::new(),
-            y: Activations::new(),
-            y_all: Activations::new(),
-            hidden: Activations::new(),
-            attention: AttentionBuffers::new(),
-            held: Vec::new(),
-        }
-    }
+/// Memory kept between calls.
+#[derive(Default)]
+pub(crate) struct DitWorkspace {
+    y: Scratch,
+    y_all: Scratch,
+    hidden: Scratch,
+    attention: AttentionWorkspace,
+    /// By block, the KV cache of each sequence; empty for cross-attention.
+    held: Vec<Vec<PackedKeyValues>>,
+    output: Scratch,
 }
 
 impl Block {
@@ -185,11 +177,11 @@ impl Dit {
             output_modulation: Linear::new(&weights.at("proj_out_1"), width, 2 * width, Role::Time)?,
             output: output?.counted(Part::Output),
             width,
-            times: Cache::new(CACHED_BUCKETS),
+            times: Cache::new(CACHED_TIMESTEPS),
         })
     }
 
-    /// For each block that attends to the vision-language tokens: its attention and which of the tokens it sees.
+    /// For each block that attends to the vision-language tokens: its attention and the tokens it sees.
     pub(crate) fn cross_attentions(&self) -> Vec<Option<(Reads, &Attention)>> {
         self.blocks
             .iter()
@@ -197,7 +189,7 @@ impl Dit {
             .collect()
     }
 
-    /// The modulations of bucket `timestep`, computed at its first use.
+    /// The modulations of `timestep`, computed at its first use.
     pub(crate) fn time(&self, engine: Engine, timestep: usize) -> Result<Arc<TimeModulations>> {
         self.times
             .get_or_insert(timestep, || self.modulations(engine, timestep))
@@ -205,9 +197,11 @@ impl Dit {
 
     fn modulations(&self, engine: Engine, timestep: usize) -> Result<TimeModulations> {
         let mut scratch = LinearScratch::new();
+        let kernels = &mut Kernels::new(engine, &mut scratch);
         let mut row = |layer: &Linear, x: &[f32], epilogue| {
             let mut out = vec![0.0; layer.out_features()];
-            layer.apply(engine, x, epilogue, &mut out, &mut scratch)?;
+            let rows = RowsMut::new(&mut out, layer.out_features());
+            layer.apply(kernels, Rows::new(x, layer.in_features()), epilogue, rows)?;
             Ok::<_, Error>(out)
         };
         let mut table = [0.0; TIME_CHANNELS];
@@ -239,202 +233,208 @@ impl Dit {
         })
     }
 
-    /// Runs all blocks over `buffers.h`, or over `buffers.action` where only these rows run, and writes the output rows of the actions,
-    /// `(sequences, action_rows, hidden_dim)`. What `recorded` has room for is kept.
-    pub(crate) fn forward(
+    /// Runs all blocks over `input.h`, or over `input.action` where only these rows run: the output rows of the actions,
+    /// `(sequences * action_rows, hidden_dim)`.
+    pub(crate) fn forward<'a>(
         &self,
-        engine: Engine,
+        kernels: &mut Kernels<'_>,
         pass: &Pass<'_>,
+        input: &mut DitInput,
         recorded: &mut Recorded<StepBlock>,
-        buffers: &mut DitBuffers,
-        out: &mut Activations,
-    ) -> Result<()> {
-        buffers.held.resize_with(self.blocks.len(), Vec::new);
-        // Taken out for the call, so that the blocks can have the other buffers; put back even if it fails.
-        let mut h = std::mem::take(&mut buffers.h); // (sequences, rows, width)
-        let mut action = std::mem::take(&mut buffers.action); // (sequences, action_rows, width)
-        let result = self
-            .run_blocks(engine, pass, recorded, buffers, &mut h, &mut action)
-            .and_then(|()| self.output(engine, &action, buffers, out));
-        (buffers.h, buffers.action) = (h, action);
-        result
-    }
-
-    fn run_blocks(
-        &self,
-        engine: Engine,
-        pass: &Pass<'_>,
-        recorded: &mut Recorded<StepBlock>,
-        buffers: &mut DitBuffers,
-        h: &mut Activations,
-        action: &mut Activations,
-    ) -> Result<()> {
+        workspace: &'a mut DitWorkspace,
+    ) -> Result<Rows<'a>> {
+        workspace.held.resize_with(self.blocks.len(), Vec::new);
+        let DitInput { h, action, times } = input;
         let groups = &pass.changes.extent.groups;
         let last = self.blocks.len() - 1;
         for index in 0..self.blocks.len() {
             check_interrupted()?;
-            let (x, all): (_, Option<&[f32]>) = match pass.rows {
-                ActiveRows::Actions => (&mut *action, None),
-                ActiveRows::Needed | ActiveRows::NeededAndHeld if index == last => {
-                    gather_action_rows(groups, self.width, h, action)?;
-                    (&mut *action, Some(h))
-                }
-                _ => (&mut *h, None),
+            let narrows =
+                index == last && matches!(pass.rows, ActiveRows::Needed | ActiveRows::NeededAndHeld);
+            if narrows {
+                gather_action_rows(groups, h.as_rows(), action)?;
+            }
+            let only_actions = narrows || pass.rows == ActiveRows::Actions;
+            let call = BlockCall {
+                pass,
+                times,
+                index,
+                first_row: if only_actions {
+                    groups.range(Group::Action).start
+                } else {
+                    0
+                },
             };
-            let call = BlockCall { engine, pass, index };
-            self.attend(call, all, recorded, buffers, x)?;
-            self.feed_forward(call, recorded, buffers, x)?;
+            let (mut x, all) = match only_actions {
+                true => (action.as_rows_mut(), narrows.then(|| h.as_rows())),
+                false => (h.as_rows_mut(), None),
+            };
+            self.attend(kernels, call, all, recorded, workspace, x.reborrow())?;
+            self.feed_forward(kernels, call, recorded, workspace, x)?;
         }
         if pass.rows == ActiveRows::All {
-            gather_action_rows(groups, self.width, h, action)?;
+            gather_action_rows(groups, h.as_rows(), action)?;
         }
-        Ok(())
+        self.output(kernels, times, action.as_rows(), workspace)
     }
 
-    /// `proj_out_2(modulated_norm(action))`.
-    fn output(
+    /// `proj_out_2(adaptive_norm(action))`.
+    fn output<'a>(
         &self,
-        engine: Engine,
-        action: &[f32],
-        buffers: &mut DitBuffers,
-        out: &mut Activations,
-    ) -> Result<()> {
-        let y = sized(&mut buffers.y, action.len())?;
-        let norm = ModulatedNorm::new(self.width, OUTPUT_EPS, |time| &time.output);
-        norm.apply(engine, &buffers.times, action, y)?;
-        let out = sized(out, action.len() / self.width * self.output.out_features())?;
-        self.output
-            .apply(engine, y, Epilogue::Store, out, &mut buffers.attention.linear)
+        kernels: &mut Kernels<'_>,
+        times: &[Arc<TimeModulations>],
+        action: Rows<'_>,
+        workspace: &'a mut DitWorkspace,
+    ) -> Result<Rows<'a>> {
+        let DitWorkspace { y, output, .. } = workspace;
+        let mut y = y.rows(action.num_rows(), self.width)?;
+        let norm = AdaptiveNorm::new(OUTPUT_EPS, |time| &time.output);
+        norm.apply(kernels.engine, times, action, y.reborrow())?;
+        let out = output.rows(action.num_rows(), self.output.out_features())?;
+        self.output.apply(kernels, y.as_rows(), Epilogue::Store, out)?;
+        Ok(output.as_rows())
     }
 
-    /// `x += attention(modulated_norm(x))`. `all` are the rows that keys and values come from where `x` is only some of them.
+    /// `x += attention(adaptive_norm(x))`. Keys and values come from the rows `all` where `x` is only some of them.
     fn attend(
         &self,
+        kernels: &mut Kernels<'_>,
         call: BlockCall<'_>,
-        all: Option<&[f32]>,
+        all: Option<Rows<'_>>,
         recorded: &mut Recorded<StepBlock>,
-        buffers: &mut DitBuffers,
-        x: &mut [f32],
+        workspace: &mut DitWorkspace,
+        x: RowsMut<'_>,
     ) -> Result<()> {
-        let BlockCall { engine, pass, index } = call;
+        let BlockCall {
+            pass,
+            times,
+            index,
+            first_row,
+        } = call;
         let block = &self.blocks[index];
-        let DitBuffers {
+        let DitWorkspace {
             y,
             y_all,
             attention,
-            times,
             held: held_by_block,
             ..
-        } = buffers;
-        let norm = ModulatedNorm::new(self.width, BLOCK_EPS, |time| &time.blocks[index]);
-        let y = sized(y, x.len())?;
-        norm.apply(engine, times, x, y)?;
-        let first_row = call.first_row(x, self.width);
+        } = workspace;
+        let norm = AdaptiveNorm::new(BLOCK_EPS, |time| &time.blocks[index]);
+        let normed = y.rows(x.num_rows(), self.width)?;
+        norm.apply(kernels.engine, times, x.as_rows(), normed)?;
+        let y = Sequences::new(y.as_rows(), call.sequences());
         let bias = Bias {
             keys: None,
             shared: pass.changes.bias(pass.step, index, first_row),
         };
-        let weights = recorded.attention(call.step_block());
+        let probabilities = recorded.attention(call.step_block());
         if let Some(reads) = block.reads {
             let subset = pass.context.positions(reads).map(|positions| Subset {
                 positions,
                 all: pass.context.num_vl_tokens,
             });
             let keys = CrossKeys {
-                packed: &pass.context.keys_values[index],
-                samples: pass.samples,
+                caches: &pass.context.keys_values[index],
                 subset,
                 bias,
+                probabilities,
             };
-            block.attention.mix_cross(engine, y, keys, weights, attention)?;
-        } else {
-            let source: &[f32] = match all {
-                None => y,
-                Some(h) => {
-                    let y_all = sized(y_all, h.len())?;
-                    norm.apply(engine, times, h, y_all)?;
-                    y_all
-                }
-            };
-            let first_held = match pass.rows {
-                ActiveRows::All | ActiveRows::Needed => None,
-                ActiveRows::NeededAndHeld => Some(0),
-                ActiveRows::Actions => Some(pass.changes.extent.groups.range(Group::Action).start),
-            };
-            let keys = SelfKeys {
-                source,
-                sequences: call.sequences(),
-                held: first_held.map(|first| Held {
-                    sequences: &mut held_by_block[index],
-                    first,
-                }),
-                bias,
-            };
-            block.attention.mix_self(engine, y, keys, weights, attention)?;
+            return block
+                .attention
+                .cross(kernels, y, keys, attention, Epilogue::Add, x);
         }
-        block.attention.out(engine, Epilogue::Add, attention, x)
+        let source = match all {
+            None => y,
+            Some(all) => {
+                let normed = y_all.rows(all.num_rows(), self.width)?;
+                norm.apply(kernels.engine, times, all, normed)?;
+                Sequences::new(y_all.as_rows(), call.sequences())
+            }
+        };
+        let first_held = match pass.rows {
+            ActiveRows::All | ActiveRows::Needed => None,
+            ActiveRows::NeededAndHeld => Some(0),
+            ActiveRows::Actions => Some(first_row),
+        };
+        let keys = SelfKeys {
+            source,
+            held: first_held.map(|first| Held {
+                caches: &mut held_by_block[index],
+                first,
+            }),
+            bias,
+            probabilities,
+        };
+        block.attention.add_self(kernels, y, keys, attention, x)
     }
 
-    /// `x += ff(norm(x))`, and what is to be done with the rows after the block.
+    /// `x += ff(norm(x))`; then patches and records the rows.
     fn feed_forward(
         &self,
+        kernels: &mut Kernels<'_>,
         call: BlockCall<'_>,
         recorded: &mut Recorded<StepBlock>,
-        buffers: &mut DitBuffers,
-        x: &mut [f32],
+        workspace: &mut DitWorkspace,
+        mut x: RowsMut<'_>,
     ) -> Result<()> {
-        let BlockCall { engine, pass, index } = call;
-        let DitBuffers {
-            y, hidden, attention, ..
-        } = buffers;
-        let y = sized(y, x.len())?;
-        ops::layer_norm(engine, self.width, BLOCK_EPS, None, x, y)?;
-        let scratch = &mut attention.linear;
-        self.blocks[index]
-            .feed_forward
-            .add(engine, y, hidden, scratch, x)?;
-        let first_row = call.first_row(x, self.width);
-        pass.changes.patch(pass.step, index, first_row, pass.samples, x);
-        if let Some(kept) = recorded.hidden(call.step_block()) {
-            kept.copy_from_slice(x);
+        let BlockCall {
+            pass,
+            index,
+            first_row,
+            ..
+        } = call;
+        let DitWorkspace { y, hidden, .. } = workspace;
+        let mut y = y.rows(x.num_rows(), self.width)?;
+        layer_norm(kernels.engine, BLOCK_EPS, None, x.as_rows(), y.reborrow())?;
+        let feed_forward = &self.blocks[index].feed_forward;
+        feed_forward.add(kernels, y.as_rows(), hidden, x.reborrow())?;
+        pass.changes
+            .patch(pass.step, index, first_row, pass.samples, x.reborrow());
+        if let Some(recorded) = recorded.hidden(call.step_block()) {
+            RowsMut::new(recorded, self.width).copy_from(x.as_rows());
         }
         Ok(())
     }
 }
 
 /// Copies the action rows, the last of each sequence, from `h` to `action`.
-fn gather_action_rows(groups: &Groups, width: usize, h: &[f32], action: &mut Activations) -> Result<()> {
-    let (sequence, actions) = (groups.num_rows() * width, groups.action * width);
-    let action = sized(action, h.len() / sequence * actions)?;
-    for (from, to) in h.chunks_exact(sequence).zip(action.chunks_exact_mut(actions)) {
-        to.copy_from_slice(&from[sequence - actions..]);
+fn gather_action_rows(groups: &Groups, h: Rows<'_>, action: &mut Scratch) -> Result<()> {
+    let actions = groups.range(Group::Action);
+    let sequences = h.num_rows() / groups.num_rows();
+    let mut action = action.rows(sequences * actions.len(), h.num_columns())?;
+    for sequence in 0..sequences {
+        let first = sequence * groups.num_rows();
+        let to = sequence * actions.len()..(sequence + 1) * actions.len();
+        let from = h.rows(first + actions.start..first + actions.end);
+        action.reborrow().rows(to).copy_from(from);
     }
     Ok(())
 }
 
-/// `norm(h) * (1 + scale) + shift` with each batch element's own scale and shift.
-struct ModulatedNorm<F> {
-    width: usize,
+/// `norm(h) * (1 + scale) + shift` with each observation's own scale and shift.
+struct AdaptiveNorm<F> {
     eps: f32,
-    /// Which of the modulations.
+    /// Selects one of the modulations of a timestep.
     of: F,
 }
 
-impl<F: Fn(&TimeModulations) -> &Modulation> ModulatedNorm<F> {
-    fn new(width: usize, eps: f32, of: F) -> Self {
-        Self { width, eps, of }
+impl<F: Fn(&TimeModulations) -> &Modulation> AdaptiveNorm<F> {
+    fn new(eps: f32, of: F) -> Self {
+        Self { eps, of }
     }
 
-    fn apply(&self, engine: Engine, times: &[Arc<TimeModulations>], h: &[f32], y: &mut [f32]) -> Result<()> {
-        let element = h.len() / times.len();
-        let (mut h, mut y) = (h, y);
-        // Usually all elements are at one time, and one call does all rows.
-        for run in times.chunk_by(Arc::ptr_eq) {
-            let (h_run, h_rest) = h.split_at(run.len() * element);
-            let (y_run, y_rest) = std::mem::take(&mut y).split_at_mut(run.len() * element);
-            let Modulation { scale, shift } = (self.of)(&run[0]);
-            ops::layer_norm(engine, self.width, self.eps, Some((scale, shift)), h_run, y_run)?;
-            (h, y) = (h_rest, y_rest);
+    fn apply(
+        &self,
+        engine: Engine,
+        times: &[Arc<TimeModulations>],
+        h: Rows<'_>,
+        mut y: RowsMut<'_>,
+    ) -> Result<()> {
+        // Usually all observations are at one timestep, and one call does all rows.
+        for (time, rows) in Sequences::new(h, times.len()).runs(times, Arc::ptr_eq) {
+            let Modulation { scale, shift } = (self.of)(time);
+            let y = y.reborrow().rows(rows.clone());
+            layer_norm(engine, self.eps, Some((scale, shift)), h.rows(rows), y)?;
         }
         Ok(())
     }

@@ -1,13 +1,18 @@
 //! Encoding observations: checks of the features, what each kind of block sees of them, and the context.
 
+use saccade_vla_kernels::Rows;
+
 use super::action_head::ActionHead;
 use super::context::{Context, Seen};
 use super::vl_encoder::VlTokens;
+use super::workspace::Workspace;
 use crate::alloc::{collected, reserve};
 use crate::array::Array;
 use crate::config::Reads;
+use crate::engine::Kernels;
 use crate::error::{Error, Result, problem, show_shape};
 use crate::inspect::trace::Keep;
+use crate::options::setters;
 
 /// The observation given to [`ActionHead::encode`].
 #[derive(Clone, Copy, Debug)]
@@ -39,37 +44,15 @@ impl<'a> Features<'a> {
         }
     }
 
-    /// With this mask of attended positions.
-    #[must_use]
-    pub fn with_attention_mask(self, mask: impl Into<Option<Array<'a, bool>>>) -> Self {
-        Self {
-            attention_mask: mask.into(),
-            ..self
-        }
-    }
-
-    /// With this mask of image tokens.
-    #[must_use]
-    pub fn with_image_mask(self, mask: impl Into<Option<Array<'a, bool>>>) -> Self {
-        Self {
-            image_mask: mask.into(),
-            ..self
-        }
-    }
-
-    /// With this mask of positions to remove.
-    #[must_use]
-    pub fn with_drop_vl(self, mask: impl Into<Option<Array<'a, bool>>>) -> Self {
-        Self {
-            drop_vl: mask.into(),
-            ..self
-        }
-    }
-
-    /// Keeping this of the VL self-attention.
-    #[must_use]
-    pub fn with_record(self, record: Keep) -> Self {
-        Self { record, ..self }
+    setters! {
+        /// With this mask of attended positions.
+        with_attention_mask(attention_mask: impl Into<Option<Array<'a, bool>>>);
+        /// With this mask of image tokens.
+        with_image_mask(image_mask: impl Into<Option<Array<'a, bool>>>);
+        /// With this mask of positions to remove.
+        with_drop_vl(drop_vl: impl Into<Option<Array<'a, bool>>>);
+        /// Keeping this of the VL self-attention.
+        with_record(record: Keep);
     }
 
     fn is_image(&self, token: usize) -> bool {
@@ -120,14 +103,19 @@ impl ActionHead {
         let vl = &self.layers.vl;
         let mut recorded = vl.recorded(features.record, batch, num_vl_tokens)?;
         let tokens = VlTokens {
-            features: features.backbone_features.data(),
+            features: Rows::new(features.backbone_features.data(), self.config.context_dim),
+            batch,
             num_vl_tokens,
             removed: removed.as_deref(),
             seen: &seen,
             cross: &self.layers.dit.cross_attentions(),
         };
         let (vl_embs, keys_values) = self.with_workspace(|workspace| {
-            vl.encode(self.engine, &tokens, &mut recorded, &mut workspace.encode)
+            let Workspace {
+                vl: memory, linear, ..
+            } = workspace;
+            let kernels = &mut Kernels::new(self.engine, linear);
+            vl.encode(kernels, &tokens, &mut recorded, memory)
         })?;
         let shape = [batch, num_vl_tokens, self.config.context_dim];
         Array::new(&vl_embs, &shape)?.check_result("vl_embs")?;
@@ -197,7 +185,7 @@ impl ActionHead {
     /// What each kind of the head's blocks sees of the features.
     ///
     /// # Errors
-    /// [`Error::Input`] if a kind that alternates with another sees nothing of an observation: its softmax is not defined (spec 5.3).
+    /// [`Error::Input`] if a kind that alternates with another sees nothing of an observation: its softmax is not defined.
     fn seen(&self, features: &Features<'_>, batch: usize, num_vl_tokens: usize) -> Result<Vec<Seen>> {
         let all_are_left = (0..batch * num_vl_tokens).all(|token| features.is_left(token));
         let mut seen = Vec::new();

@@ -34,7 +34,6 @@ impl HeadLayers {
     ) -> Result<Self> {
         let (width, hidden, future) = (config.width, config.hidden_dim, config.num_future_tokens);
         let future_tokens = weights.at("future_tokens").table([future, width], future)?;
-        let future_rows = future_tokens.len() / width; // none of an outline
         let positions = match config.add_pos_embed {
             true => Some(
                 weights
@@ -45,7 +44,7 @@ impl HeadLayers {
         };
         let states = config.state_dim * config.state_history;
         Ok(Self {
-            future_tokens: OwnedArray::new(future_tokens, &[future_rows, width])?,
+            future_tokens,
             vl: VlEncoder::new(weights, config)?,
             state_encoder: EmbodimentMlp::new(
                 &weights.at("state_encoder"),

@@ -2,8 +2,8 @@
 
 use std::path::Path;
 
-use saccade_vla_checkpoint::granted;
-use saccade_vla_checkpoint::spec::{self, TensorProblem};
+use saccade_vla_checkpoint::probe_allocation;
+use saccade_vla_checkpoint::spec;
 
 use super::action_head::ActionHead;
 use super::embodiments::{Embodiments, chosen_embodiments};
@@ -12,10 +12,11 @@ use super::plan::{is_unused, reading_order, specs_of};
 use super::state_dropout::{STATE_DROPOUT, StateDropout, reads_state_dropout};
 use crate::config::HeadConfig;
 use crate::engine::Engine;
-use crate::error::{Error, Problem, Result, problem};
+use crate::error::{Error, Result, problem};
 use crate::nn::source::file::FileSource;
 use crate::nn::source::memory::{self, MemorySource, TensorViews};
 use crate::nn::weights::{Builder, Source};
+use crate::options::setters;
 use crate::precision::Precision;
 use crate::recognise::HeadCheckpoint;
 
@@ -44,55 +45,19 @@ pub struct LoadOptions {
 }
 
 impl LoadOptions {
-    /// With this config, as JSON.
-    #[must_use]
-    pub fn with_config(self, config: impl Into<Option<String>>) -> Self {
-        Self {
-            config: config.into(),
-            ..self
-        }
-    }
-
-    /// With these embodiments only.
-    #[must_use]
-    pub fn with_embodiment_ids(self, embodiment_ids: impl Into<Option<Vec<i64>>>) -> Self {
-        Self {
-            embodiment_ids: embodiment_ids.into(),
-            ..self
-        }
-    }
-
-    /// With this number of actions in a chunk.
-    #[must_use]
-    pub fn with_action_horizon(self, action_horizon: impl Into<Option<usize>>) -> Self {
-        Self {
-            action_horizon: action_horizon.into(),
-            ..self
-        }
-    }
-
-    /// With this number of states in an observation.
-    #[must_use]
-    pub fn with_num_states(self, num_states: impl Into<Option<usize>>) -> Self {
-        Self {
-            num_states: num_states.into(),
-            ..self
-        }
-    }
-
-    /// With this precision.
-    #[must_use]
-    pub fn with_precision(self, precision: Precision) -> Self {
-        Self { precision, ..self }
-    }
-
-    /// With this number of threads.
-    #[must_use]
-    pub fn with_num_threads(self, num_threads: impl Into<Option<usize>>) -> Self {
-        Self {
-            num_threads: num_threads.into(),
-            ..self
-        }
+    setters! {
+        /// With this config, as JSON.
+        with_config(config: impl Into<Option<String>>);
+        /// With these embodiments only.
+        with_embodiment_ids(embodiment_ids: impl Into<Option<Vec<i64>>>);
+        /// With this number of actions in a chunk.
+        with_action_horizon(action_horizon: impl Into<Option<usize>>);
+        /// With this number of states in an observation.
+        with_num_states(num_states: impl Into<Option<usize>>);
+        /// With this precision.
+        with_precision(precision: Precision);
+        /// With this number of threads.
+        with_num_threads(num_threads: impl Into<Option<usize>>);
     }
 
     /// The head's config with the actions and states that were asked for.
@@ -131,7 +96,7 @@ impl ActionHead {
             published.config.num_embodiments,
         )?;
         published.check()?;
-        granted(
+        probe_allocation(
             "source",
             published.nbytes(options.precision, embodiment_ids.len())?,
         )?;
@@ -170,15 +135,7 @@ impl ActionHead {
         let problems = memory::problems(tensors, &specs_of(&config, has)?, |name, shape| {
             is_unused(&config, name, shape)
         });
-        if !problems.is_empty() {
-            let problem = Problem::new("tensors", spec::list(&problems, "the config"));
-            let is_shape = |problem: &TensorProblem| matches!(problem, TensorProblem::Shape(_));
-            return Err(if problems.iter().all(is_shape) {
-                Error::Shape(problem)
-            } else {
-                Error::Checkpoint(problem)
-            });
-        }
+        memory::check(&problems, |problems| spec::list(problems, "the config"))?;
         let drops_states = reads_state_dropout(given_config, has(STATE_DROPOUT))?;
         let source = MemorySource::new(tensors);
         Self::build(&source, engine, config, embodiment_ids, drops_states)
@@ -191,24 +148,25 @@ impl ActionHead {
         embodiment_ids: Vec<usize>,
         drops_states: bool,
     ) -> Result<Self> {
-        let builder = Builder::new(source, engine);
         let embodiments = Embodiments {
             ids: &embodiment_ids,
             count: config.num_embodiments,
         };
-        // First, since it is small and may be refused.
-        let state_dropout = match drops_states {
-            true => StateDropout::read(&builder.weights(), config.num_embodiments)?,
-            false => StateDropout::none(),
-        };
-        let layers = HeadLayers::new(&builder.weights(), &config, embodiments)?;
+        let ((state_dropout, layers), nbytes) = Builder::build(source, engine, |weights| {
+            // First, since it is small and may be refused.
+            let state_dropout = match drops_states {
+                true => StateDropout::read(weights, config.num_embodiments)?,
+                false => StateDropout::none(),
+            };
+            Ok((state_dropout, HeadLayers::new(weights, &config, embodiments)?))
+        })?;
         Ok(Self::new(
             config,
             engine,
             embodiment_ids,
             layers,
             state_dropout,
-            builder.nbytes(),
+            nbytes,
         ))
     }
 }

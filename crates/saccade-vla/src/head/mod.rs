@@ -10,6 +10,7 @@ mod dit;
 mod embodiment_layers;
 pub(crate) mod embodiments;
 pub(crate) mod encode;
+mod flow_matching;
 mod layers;
 pub(crate) mod load;
 pub(crate) mod plan;

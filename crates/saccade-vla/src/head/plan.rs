@@ -1,17 +1,13 @@
 //! The tensors of a head without the head: what its checkpoint must hold, and in which order it is read.
 
 use saccade_vla_checkpoint::{TensorSpec, Wanted};
-use saccade_vla_kernels::Isa;
 
 use super::embodiments::Embodiments;
 use super::layers::HeadLayers;
 use super::state_dropout::STATE_DROPOUT;
 use crate::config::HeadConfig;
-use crate::engine::Engine;
 use crate::error::Result;
-use crate::nn::source::planner::{Plan, Planner};
-use crate::nn::weights::Builder;
-use crate::precision::Precision;
+use crate::nn::source::planner::{Plan, plan};
 
 /// Name, without a prefix, and shape of every tensor that a head's checkpoint must hold.
 ///
@@ -44,7 +40,7 @@ pub(crate) fn specs_of(config: &HeadConfig, has: impl Fn(&str) -> bool) -> Resul
 /// As [`tensor_shapes`].
 pub(crate) fn tensor_specs(config: &HeadConfig) -> Result<Vec<TensorSpec>> {
     // Any embodiment: they have the same tensors.
-    Ok(plan(config, &[0])?.specs)
+    Ok(planned(config, &[0])?.specs)
 }
 
 /// What a head with these embodiments reads, in the order in which it is built.
@@ -52,22 +48,12 @@ pub(crate) fn tensor_specs(config: &HeadConfig) -> Result<Vec<TensorSpec>> {
 /// # Errors
 /// As [`tensor_shapes`].
 pub(crate) fn reading_order(config: &HeadConfig, embodiment_ids: &[usize]) -> Result<Vec<Wanted>> {
-    Ok(plan(config, embodiment_ids)?.wanted)
+    Ok(planned(config, embodiment_ids)?.wanted)
 }
 
-fn plan(config: &HeadConfig, ids: &[usize]) -> Result<Plan> {
-    let planner = Planner::default();
-    let engine = Engine {
-        isa: Isa::best(),
-        threads: 1,
-        precision: Precision::default(),
-    };
-    let embodiments = Embodiments {
-        ids,
-        count: config.num_embodiments,
-    };
-    HeadLayers::new(&Builder::new(&planner, engine).weights(), config, embodiments)?;
-    Ok(planner.into_plan())
+fn planned(config: &HeadConfig, ids: &[usize]) -> Result<Plan> {
+    let count = config.num_embodiments;
+    plan(|weights| HeadLayers::new(weights, config, Embodiments { ids, count }))
 }
 
 /// Whether a head of this config may come with a tensor `name`, without a prefix, of this shape, that only its training uses: the forks'

@@ -3,13 +3,14 @@
 //! The class of GR00T-H keeps how often its training sets the state of each embodiment to zero in a tensor, and at inference sets those to
 //! zero that it always did so for.
 
+use saccade_vla_kernels::Rows;
 use serde_json::Value;
 
-use crate::alloc::sized;
+use crate::alloc::Scratch;
 use crate::config::CheckpointConfig;
 use crate::error::{Error, Problem, Result, problem};
+use crate::nn::sequences::Sequences;
 use crate::nn::weights::Weights;
-use saccade_vla_kernels::Activations;
 
 /// The probabilities' tensor, `(num_embodiments,)`.
 pub(crate) const STATE_DROPOUT: &str = "dropout_prob_by_embodiment";
@@ -72,25 +73,26 @@ impl StateDropout {
         Ok(Self { drops })
     }
 
-    /// The states, as many numbers for each of the `embodiment_ids`, as the state encoder sees them: in `zeroed` if some are set to zero.
+    /// The rows of states, equally many for each of the `embodiment_ids`, as the state encoder sees them: in `zeroed` if
+    /// some are set to zero.
     pub(super) fn seen<'a>(
         &self,
         embodiment_ids: &[usize],
-        states: &'a [f32],
-        zeroed: &'a mut Activations,
-    ) -> Result<&'a [f32]> {
+        states: Rows<'a>,
+        zeroed: &'a mut Scratch,
+    ) -> Result<Rows<'a>> {
         let is_dropped = |id: &usize| self.drops.get(*id) == Some(&true);
         if !embodiment_ids.iter().any(is_dropped) {
             return Ok(states);
         }
-        let zeroed = sized(zeroed, states.len())?;
-        zeroed.copy_from_slice(states);
-        let rows = zeroed.chunks_exact_mut(states.len() / embodiment_ids.len());
-        for (row, id) in rows.zip(embodiment_ids) {
+        let mut seen = zeroed.rows(states.num_rows(), states.num_columns())?;
+        seen.copy_from(states);
+        let observations = Sequences::new(states, embodiment_ids.len());
+        for (id, rows) in observations.runs(embodiment_ids, |a, b| a == b) {
             if is_dropped(id) {
-                row.fill(0.0);
+                seen.reborrow().rows(rows).fill(0.0);
             }
         }
-        Ok(zeroed)
+        Ok(zeroed.as_rows())
     }
 }

@@ -2,20 +2,18 @@
 
 use std::path::Path;
 
-use super::action_encoder::CACHED_BRACKETS;
+use saccade_vla_kernels::Rows;
+
+use super::action_encoder::CACHED_TIME_BIASES;
 use super::action_head::ActionHead;
 use super::context::Context;
 use super::dit::{ActiveRows, Pass};
 use super::encode::Features;
 use super::load::LoadOptions;
-use super::plan::tensor_shapes;
 use super::workspace::Workspace;
-use crate::alloc::sized;
 use crate::array::Array;
 use crate::inspect::changes::Changes;
 use crate::inspect::trace::Recorded;
-use crate::precision::Precision;
-use crate::recognise::HeadCheckpoint;
 use crate::sampling::timestep_embedding::action_encoder_embedding;
 
 /// A released head, with the config in the file's metadata.
@@ -59,23 +57,12 @@ fn context(head: &ActionHead, batch: usize) -> Context {
 
 /// One velocity with all rows, or only the needed ones, in the last block.
 fn velocity(head: &ActionHead, context: &Context, timestep: usize, rows: ActiveRows) -> Vec<f32> {
-    let mut workspace = Workspace::new();
+    let mut workspace = Workspace::default();
     let config = &head.config;
     workspace
         .embodiment_ids
-        .extend((0..context.batch).map(|element| element % 2));
-    let actions = numbers(
-        context.batch * config.action_horizon * config.encoder_action_dim,
-        2,
-    );
-    sized(&mut workspace.x, actions.len())
-        .unwrap()
-        .copy_from_slice(&actions);
-    let times = &mut workspace.dit.times;
-    times.resize(
-        context.batch,
-        head.layers.dit.time(head.engine, timestep).unwrap(),
-    );
+        .extend((0..context.batch).map(|observation| observation % 2));
+    noisy_actions(head, context.batch, &mut workspace);
     let state = numbers(context.batch * config.num_states * config.state_dim, 3);
     head.encode_state(&state, &mut workspace).unwrap();
     let changes = Changes::new(&[], head.extent(&[], context, 1).unwrap()).unwrap();
@@ -86,9 +73,17 @@ fn velocity(head: &ActionHead, context: &Context, timestep: usize, rows: ActiveR
         step: 0,
         rows,
     };
-    head.step_velocity(&pass, |_| timestep, &mut Recorded::default(), &mut workspace)
+    head.evaluate(&pass, |_| timestep, &mut Recorded::default(), &mut workspace)
         .unwrap();
-    workspace.velocity.to_vec()
+    workspace.velocity.as_slice().to_vec()
+}
+
+/// Writes noisy actions of one chunk for each observation to `workspace.x`.
+fn noisy_actions(head: &ActionHead, batch: usize, workspace: &mut Workspace) {
+    let width = head.config.encoder_action_dim;
+    let actions = numbers(batch * head.config.action_horizon * width, 2);
+    let mut x = workspace.x.rows(actions.len() / width, width).unwrap();
+    x.copy_from(Rows::new(&actions, width));
 }
 
 const FILES: [&str; 5] = [
@@ -113,11 +108,11 @@ fn the_last_block_on_action_rows_only_changes_no_bit() {
 }
 
 #[test]
-fn kept_modulations_and_brackets_change_no_bit() {
+fn cached_modulations_and_time_biases_change_no_bit() {
     let (head, fresh) = (released(FILES[0]), released(FILES[0]));
     let kept = context(&head, 2);
     let first = velocity(&head, &kept, 250, ActiveRows::Needed);
-    for timestep in 0..CACHED_BRACKETS + 10 {
+    for timestep in 0..CACHED_TIME_BIASES + 10 {
         velocity(&head, &kept, timestep, ActiveRows::Needed);
     }
     assert_eq!(
@@ -164,12 +159,9 @@ fn the_action_encoder_taken_apart_is_the_plain_one() {
         }
         out
     };
-    let mut workspace = Workspace::new();
+    let mut workspace = Workspace::default();
     workspace.embodiment_ids.push(id);
-    let actions = numbers(head.config.action_horizon * head.config.encoder_action_dim, 2);
-    sized(&mut workspace.x, actions.len())
-        .unwrap()
-        .copy_from_slice(&actions);
+    noisy_actions(&head, 1, &mut workspace);
     head.encode_actions(|_| timestep, &mut workspace).unwrap();
 
     let mut tau = vec![0.0; width];
@@ -178,8 +170,7 @@ fn the_action_encoder_taken_apart_is_the_plain_one() {
         .read_f32("action_head.position_embedding.weight")
         .unwrap();
     let positions = &table[..head.config.action_horizon * width];
-    let actions = workspace.x.chunks_exact(head.config.encoder_action_dim);
-    for (row, action) in actions.enumerate() {
+    for (row, action) in workspace.x.as_rows().iter().enumerate() {
         let action: Vec<f64> = action.iter().copied().map(f64::from).collect();
         let mut both = linear("W1", &action);
         both.extend(tau.iter().copied().map(f64::from));
@@ -190,77 +181,11 @@ fn the_action_encoder_taken_apart_is_the_plain_one() {
         for (column, expected) in linear("W3", &hidden).into_iter().enumerate() {
             let index = row * width + column;
             let expected = expected + f64::from(positions[index]);
-            let error = (f64::from(workspace.encoded[index]) - expected).abs();
+            let error = (f64::from(workspace.action.as_slice()[index]) - expected).abs();
             assert!(
                 error <= 2e-6 * expected.abs().max(1.0),
                 "row {row}, column {column}: {error}"
             );
         }
-    }
-}
-
-#[test]
-fn encoding_in_chunks_changes_no_bit() {
-    // 200 observations of 9 tokens are more rows than are encoded together.
-    let head = released(FILES[0]);
-    let many = context(&head, 200);
-    let width = head.config.context_dim;
-    for element in [0, 113, 199] {
-        let features = numbers(200 * 9 * width, 1);
-        let one = &features[element * 9 * width..(element + 1) * 9 * width];
-        let one = head
-            .encode(&Features::new(Array::new(one, &[1, 9, width]).unwrap()))
-            .unwrap();
-        assert_eq!(
-            one.vl_embs(),
-            &many.vl_embs()[element * 9 * width..(element + 1) * 9 * width]
-        );
-    }
-}
-
-/// The planner, the file and the sizer run the same description.
-#[test]
-fn the_size_is_known_before_loading() {
-    for name in FILES {
-        let path = Path::new(env!("CARGO_MANIFEST_DIR"))
-            .join("../../tests/data")
-            .join(name);
-        let config = config_of(&path);
-        let published = HeadCheckpoint::open(&path, Some(&config)).unwrap();
-        for precision in [Precision::Float32, Precision::Bfloat16, Precision::Int8] {
-            for ids in [vec![1], vec![0, 2]] {
-                let options = LoadOptions::default()
-                    .with_config(config.clone())
-                    .with_precision(precision)
-                    .with_embodiment_ids(ids.clone());
-                let head = ActionHead::load(&path, &options).unwrap();
-                let expected = published.nbytes(precision, ids.len()).unwrap();
-                assert_eq!(head.nbytes(), expected, "{name}, {precision}");
-            }
-        }
-    }
-}
-
-/// Every tensor of a released file is one that the description asks for, and the other way round.
-#[test]
-fn the_plan_has_the_tensors_of_the_released_files() {
-    for name in FILES {
-        let head = released(name);
-        let path = Path::new(env!("CARGO_MANIFEST_DIR"))
-            .join("../../tests/data")
-            .join(name);
-        let checkpoint = crate::Checkpoint::open(&path).unwrap();
-        let mut planned: Vec<_> = tensor_shapes(&head.config)
-            .unwrap()
-            .into_iter()
-            .map(|(tensor, _)| format!("action_head.{tensor}"))
-            .collect();
-        planned.sort();
-        let is_unused = |tensor: &str| tensor.contains("task_log_sigma") || tensor.contains("mask_token");
-        let stored: Vec<_> = checkpoint
-            .names()
-            .filter(|tensor| tensor.starts_with("action_head.") && !is_unused(tensor))
-            .collect();
-        assert_eq!(planned, stored, "{name}");
     }
 }

@@ -3,7 +3,8 @@
 use super::action_head::ActionHead;
 use super::context::Context;
 use super::dit::{ActiveRows, Pass};
-use super::sample::{Sampling, Steps};
+use super::flow_matching::Steps;
+use super::sample::Sampling;
 use crate::alloc::filled;
 use crate::array::{Array, OwnedArray};
 use crate::error::{Error, Result, problem};
@@ -58,7 +59,7 @@ impl ActionHead {
             .map(|key| (key, self.shapes(&groups, batch, key)))
             .collect();
         // Before the interventions are worked out, since that takes memory too.
-        let mut recorded = Recorded::claim("max_bytes", options.record, &shapes, options.max_bytes)?;
+        let mut recorded = Recorded::allocate("max_bytes", options.record, &shapes, options.max_bytes)?;
         let changes = Changes::new(sampling.interventions, extent)?;
         let pass = Pass {
             context,
@@ -76,10 +77,10 @@ impl ActionHead {
             self.check_embodiments(embodiment_id, batch, &mut workspace.embodiment_ids)?;
             self.encode_state(state, workspace)?;
             self.begin(noise.data(), seam.as_ref(), samples, workspace)?;
-            self.follow(&pass, steps, &mut recorded, workspace)?;
+            self.integrate(&pass, steps, &mut recorded, workspace)?;
             let shape = [batch, config.action_horizon, config.action_dim];
             let mut actions = filled("actions", shape.iter().product(), 0.0)?;
-            self.copy_actions(&workspace.x, noise.shape(), &mut actions)?;
+            self.copy_actions(workspace.x.as_rows(), noise.shape(), &mut actions)?;
             Ok(Trace {
                 recorded,
                 groups,

@@ -1,25 +1,27 @@
-//! The vision-language tokens (spec 1.5): `vlln`, the VL self-attention, and what the cross-attention blocks make of the result.
+//! The vision-language tokens: `vlln`, the VL self-attention, and the KV caches of the cross-attention blocks.
 
 use std::ops::Range;
 
-use saccade_vla_kernels::{Activations, Epilogue, LinearScratch, PackedKeyValues};
+use saccade_vla_kernels::{Epilogue, PackedKeyValues, Rows, RowsMut};
 
 use super::context::Seen;
-use crate::alloc::{collected, filled, sized};
+use crate::alloc::{Scratch, collected, filled};
 use crate::config::{HeadConfig, Reads};
-use crate::engine::Engine;
+use crate::engine::Kernels;
 use crate::error::Result;
 use crate::inspect::trace::{Keep, Recorded, Shapes};
-use crate::nn::attention::{Attention, AttentionBuffers, Bias, SelfKeys};
+use crate::nn::attention::{Attention, AttentionWorkspace, Bias, SelfKeys};
 use crate::nn::feed_forward::{DIFFUSERS, FeedForward};
 use crate::nn::norm::LayerNorm;
+use crate::nn::sequences::Sequences;
 use crate::nn::weights::Weights;
 use crate::ops::check_interrupted;
 use crate::precision::Role;
 use crate::profile::Part;
 
-/// Rows of vision-language tokens that are encoded together. More rows read the weights less often; fewer keep the intermediate
-/// activations small. At 1024 rows the weights are read once per 3 to 4 camera views and the largest buffer is 32 MB at N1.5's size.
+/// Rows of vision-language tokens that are encoded together. More rows read the weights less often; fewer keep the
+/// intermediate activations small. At 1024 rows the weights are read once per 3 to 4 camera views and the largest buffer
+/// is 32 MB at N1.5's size.
 const ENCODE_ROWS: usize = 1024;
 
 const EPS: f32 = 1e-5;
@@ -43,39 +45,30 @@ struct VlBlock {
     feed_forward: FeedForward,
 }
 
-/// What is encoded, and for whom.
+/// The tokens to encode, and the readers of the result.
 pub(crate) struct VlTokens<'a> {
-    /// `(batch, num_vl_tokens, context_dim)`.
-    pub features: &'a [f32],
+    /// `(batch * num_vl_tokens, context_dim)`.
+    pub features: Rows<'a>,
+    pub batch: usize,
     pub num_vl_tokens: usize,
-    /// What is added to the logits of each token in the VL self-attention, `(batch, num_vl_tokens)`: minus infinity removes it.
+    /// Biases of the logits of each token in the VL self-attention, `(batch, num_vl_tokens)`: minus infinity removes it.
     pub removed: Option<&'a [f32]>,
-    /// What each kind of cross-attention block sees.
+    /// The tokens that each kind of cross-attention block sees.
     pub seen: &'a [Seen],
-    /// For each block of the transformer that attends to these tokens: its attention and which of the tokens it sees.
+    /// For each block of the transformer that attends to these tokens: its attention and the tokens it sees.
     pub cross: &'a [Option<(Reads, &'a Attention)>],
 }
 
-/// The tokens as the cross-attention blocks see them, `(batch, num_vl_tokens, context_dim)`, and by block their keys and values.
+/// The tokens as the cross-attention blocks see them, `(batch, num_vl_tokens, context_dim)`, and by block their KV caches.
 pub(crate) type Encoded = (Vec<f32>, Vec<Vec<PackedKeyValues>>);
 
-/// Memory of one `encode` that is kept for the next.
-pub(crate) struct EncodeBuffers {
-    y: Activations,
-    gathered: Activations,
-    hidden: Activations,
-    attention: AttentionBuffers,
-}
-
-impl EncodeBuffers {
-    pub(crate) fn new() -> Self {
-        Self {
-            y: Activations::new(),
-            gathered: Activations::new(),
-            hidden: Activations::new(),
-            attention: AttentionBuffers::new(),
-        }
-    }
+/// Memory kept between calls.
+#[derive(Default)]
+pub(crate) struct VlWorkspace {
+    y: Scratch,
+    gathered: Scratch,
+    hidden: Scratch,
+    attention: AttentionWorkspace,
 }
 
 impl VlBlock {
@@ -127,122 +120,136 @@ impl VlEncoder {
             (block, Shapes { attention, hidden })
         };
         let blocks: Vec<_> = (0..self.blocks.len()).map(shapes).collect();
-        Recorded::claim("record", record, &blocks, MAX_RECORDED_BYTES)
+        Recorded::allocate("record", record, &blocks, MAX_RECORDED_BYTES)
     }
 
-    /// The tokens that the cross-attention blocks see, and their keys and values in each of these. What `recorded` has room for is kept.
+    /// The tokens that the cross-attention blocks see, and their KV caches. Records what `recorded` has room for.
     pub(crate) fn encode(
         &self,
-        engine: Engine,
+        kernels: &mut Kernels<'_>,
         tokens: &VlTokens<'_>,
         recorded: &mut Recorded<usize>,
-        buffers: &mut EncodeBuffers,
+        workspace: &mut VlWorkspace,
     ) -> Result<Encoded> {
-        let VlTokens {
+        let &VlTokens {
             features,
+            batch,
             num_vl_tokens,
             ..
-        } = *tokens;
-        let mut vl_embs = filled("vl_embs", features.len(), 0.0)?;
-        let batch = features.len() / (num_vl_tokens * self.context_dim);
-        let mut keys_values = Vec::new();
+        } = tokens;
+        let len = features.num_rows() * features.num_columns();
+        let mut vl_embs = filled("vl_embs", len, 0.0)?;
+        let mut vl = RowsMut::new(&mut vl_embs, self.context_dim);
+        let mut caches = Vec::new();
         for block in tokens.cross {
             let held = if block.is_some() { batch } else { 0 };
-            keys_values.push(collected("keys and values", held, [])?);
+            caches.push(collected("keys and values", held, [])?);
         }
-        let together = (ENCODE_ROWS / num_vl_tokens).max(1); // observations
-        let chunk = together * num_vl_tokens * self.context_dim;
-        for (index, vl) in vl_embs.chunks_mut(chunk).enumerate() {
-            let first = index * together;
-            let elements = first..first + vl.len() / (num_vl_tokens * self.context_dim);
-            self.tokens(engine, tokens, elements.clone(), recorded, buffers, vl)?;
-            self.project(engine, tokens, elements, vl, &mut keys_values, buffers)?;
+        let together = (ENCODE_ROWS / num_vl_tokens).max(1);
+        for first in (0..batch).step_by(together) {
+            let observations = first..batch.min(first + together);
+            let rows = observations.start * num_vl_tokens..observations.end * num_vl_tokens;
+            let mut vl = vl.reborrow().rows(rows);
+            self.tokens(
+                kernels,
+                tokens,
+                observations.clone(),
+                recorded,
+                workspace,
+                vl.reborrow(),
+            )?;
+            self.project(
+                kernels,
+                tokens,
+                observations,
+                vl.as_rows(),
+                &mut caches,
+                workspace,
+            )?;
         }
         if let Some(removed) = tokens.removed {
-            for (row, &removed) in vl_embs.chunks_exact_mut(self.context_dim).zip(removed) {
+            for (row, &removed) in vl.iter_mut().zip(removed) {
                 if removed != 0.0 {
                     row.fill(0.0);
                 }
             }
         }
-        Ok((vl_embs, keys_values))
+        Ok((vl_embs, caches))
     }
 
-    /// Adds the keys and values of `elements`, whose tokens are `vl`, to those of each block.
+    /// Adds the KV caches of `observations`, whose tokens are `vl`, to those of each block.
     fn project(
         &self,
-        engine: Engine,
+        kernels: &mut Kernels<'_>,
         tokens: &VlTokens<'_>,
-        elements: Range<usize>,
-        vl: &[f32],
-        keys_values: &mut [Vec<PackedKeyValues>],
-        buffers: &mut EncodeBuffers,
+        observations: Range<usize>,
+        vl: Rows<'_>,
+        caches: &mut [Vec<PackedKeyValues>],
+        workspace: &mut VlWorkspace,
     ) -> Result<()> {
-        let EncodeBuffers {
-            gathered,
-            hidden,
-            attention: AttentionBuffers { linear, .. },
-            ..
-        } = buffers;
+        let VlWorkspace { gathered, hidden, .. } = workspace;
         for seen in tokens.seen {
-            let counts = seen.counts(elements.clone(), tokens.num_vl_tokens);
-            let rows = seen.rows(elements.clone(), vl, self.context_dim, gathered)?;
-            for (block, keys_values) in tokens.cross.iter().zip(&mut *keys_values) {
+            let counts = seen.counts(observations.clone(), tokens.num_vl_tokens);
+            let rows = seen.rows(observations.clone(), vl, gathered)?;
+            for (block, caches) in tokens.cross.iter().zip(&mut *caches) {
                 if let Some((reads, attention)) = block
                     && *reads == seen.reads
                 {
-                    keys_values.extend(attention.project(engine, rows, &counts, hidden, linear)?);
+                    caches.extend(attention.project(kernels, rows, &counts, hidden)?);
                 }
             }
         }
         Ok(())
     }
 
-    /// The tokens of the observations `elements`, to `vl`.
+    /// The tokens of `observations`, to `vl`.
     fn tokens(
         &self,
-        engine: Engine,
+        kernels: &mut Kernels<'_>,
         tokens: &VlTokens<'_>,
-        elements: Range<usize>,
+        observations: Range<usize>,
         recorded: &mut Recorded<usize>,
-        buffers: &mut EncodeBuffers,
-        vl: &mut [f32],
+        workspace: &mut VlWorkspace,
+        mut vl: RowsMut<'_>,
     ) -> Result<()> {
         let num_vl_tokens = tokens.num_vl_tokens;
-        // The part of `(batch, ...)` that belongs to the elements.
-        let part = |size: usize| elements.start * size..elements.end * size;
-        let features = &tokens.features[part(num_vl_tokens * self.context_dim)];
+        // The part of `(batch, ...)` that belongs to the observations.
+        let part = |size: usize| observations.start * size..observations.end * size;
+        let features = tokens.features.rows(part(num_vl_tokens));
         let bias = Bias {
             keys: tokens.removed.map(|removed| &removed[part(num_vl_tokens)]),
             shared: None,
         };
         match &self.vlln {
-            Some(vlln) => vlln.apply(engine, features, vl)?,
-            None => vl.copy_from_slice(features),
+            Some(vlln) => vlln.apply(kernels.engine, features, vl.reborrow())?,
+            None => vl.copy_from(features),
         }
         for (index, block) in self.blocks.iter().enumerate() {
             check_interrupted()?;
-            let EncodeBuffers {
+            let VlWorkspace {
                 y, hidden, attention, ..
-            } = &mut *buffers;
-            let y = sized(y, vl.len())?;
-            block.norm1.apply(engine, vl, y)?;
-            let weights = recorded
-                .attention(index)
-                .map(|all| &mut all[part(self.num_heads * num_vl_tokens * num_vl_tokens)]);
+            } = &mut *workspace;
+            let mut y = y.rows(vl.num_rows(), vl.num_columns())?;
+            block.norm1.apply(kernels.engine, vl.as_rows(), y.reborrow())?;
+            let sequences = Sequences::new(y.as_rows(), observations.len());
             let keys = SelfKeys {
-                source: y,
-                sequences: elements.len(),
+                source: sequences,
                 held: None,
                 bias,
+                probabilities: recorded
+                    .attention(index)
+                    .map(|all| &mut all[part(self.num_heads * num_vl_tokens * num_vl_tokens)]),
             };
-            block.attention.mix_self(engine, y, keys, weights, attention)?;
-            block.attention.out(engine, Epilogue::Add, attention, vl)?;
-            block.norm3.apply(engine, vl, y)?;
-            let scratch: &mut LinearScratch = &mut attention.linear;
-            block.feed_forward.add(engine, y, hidden, scratch, vl)?;
-            if let Some(kept) = recorded.hidden(index) {
-                kept[part(num_vl_tokens * self.context_dim)].copy_from_slice(vl);
+            block
+                .attention
+                .add_self(kernels, sequences, keys, attention, vl.reborrow())?;
+            block.norm3.apply(kernels.engine, vl.as_rows(), y.reborrow())?;
+            block
+                .feed_forward
+                .add(kernels, y.as_rows(), hidden, vl.reborrow())?;
+            if let Some(recorded) = recorded.hidden(index) {
+                let recorded = RowsMut::new(recorded, self.context_dim);
+                recorded.rows(part(num_vl_tokens)).copy_from(vl.as_rows());
             }
         }
         Ok(())

@@ -64,7 +64,7 @@ impl ActionHead {
         for &id in &self.embodiment_ids {
             for step in 0..config.num_steps {
                 let timestep = timestep(step, config.num_steps, config.num_timestep_buckets);
-                self.layers.action_encoder.bracket(self.engine, id, timestep)?;
+                self.layers.action_encoder.time_bias(self.engine, id, timestep)?;
             }
         }
         let embodiment_id = [self.embodiment_ids[0] as i64];

@@ -1,61 +1,39 @@
-//! Memory of one call, kept for the next call.
+//! Memory of calls of the head, kept between calls.
 
-use saccade_vla_kernels::{Activations, LinearScratch};
+use saccade_vla_kernels::LinearScratch;
 
-use super::dit::DitBuffers;
-use super::vl_encoder::EncodeBuffers;
+use super::dit::{DitInput, DitWorkspace};
+use super::vl_encoder::VlWorkspace;
+use crate::alloc::Scratch;
 
-/// Grows to what the largest call needs.
+/// Memory kept between calls; grows to the needs of the largest.
+#[derive(Default)]
 pub(crate) struct Workspace {
-    pub encode: EncodeBuffers,
-    pub dit: DitBuffers,
-    /// By batch element.
+    pub vl: VlWorkspace,
+    pub input: DitInput,
+    pub dit: DitWorkspace,
+    /// By observation.
     pub embodiment_ids: Vec<usize>,
-    /// States of which some are set to zero, `(batch, num_states * state_dim)`.
-    pub seen_state: Activations,
-    /// The state encoder's hidden layer, `(batch, state_rows, hidden_dim)`.
-    pub state_hidden: Activations,
-    /// State rows, `(batch, state_rows, width)`.
-    pub state: Activations,
-    /// Noisy actions, `(batch, samples, action_horizon, encoder_action_dim)`.
-    pub x: Activations,
+    /// States of which some are set to zero, `(batch * state_rows, inputs of a state row)`.
+    pub zeroed_state: Scratch,
+    /// The state encoder's hidden layer, `(batch * state_rows, hidden_dim)`.
+    pub state_hidden: Scratch,
+    /// State rows, `(batch * state_rows, width)`.
+    pub state: Scratch,
+    /// Noisy actions, `(batch * samples * action_horizon, encoder_action_dim)`.
+    pub x: Scratch,
     /// `x` at the start of a step of two evaluations.
-    pub start: Activations,
-    /// What the velocity of each action of a chunk is multiplied by.
-    pub strength: Activations,
-    /// The action encoder's hidden layer, `(batch, samples, action_horizon, width)`.
-    pub tokens: Activations,
-    /// Action rows, `(batch, samples, action_horizon, width)`.
-    pub encoded: Activations,
-    /// The transformer's output rows, `(batch, samples, action_horizon, hidden_dim)`.
-    pub output: Activations,
-    pub decoder_hidden: Activations,
-    /// One decoder's output, `(batch, samples, action_horizon, width of the decoder)`.
-    pub decoded: Activations,
-    /// `(batch, samples, action_horizon, action_dim)`.
-    pub velocity: Activations,
+    pub start: Scratch,
+    /// Factor of the velocity of each action of a chunk, `(action_horizon,)`.
+    pub strength: Vec<f32>,
+    /// The action encoder's hidden layer, `(batch * samples * action_horizon, width)`.
+    pub action_hidden: Scratch,
+    /// Action rows, `(batch * samples * action_horizon, width)`.
+    pub action: Scratch,
+    pub decoder_hidden: Scratch,
+    /// One decoder's output, `(batch * samples * action_horizon, width of the decoder)`.
+    pub decoded: Scratch,
+    /// `(batch * samples * action_horizon, action_dim)`.
+    pub velocity: Scratch,
     pub linear: LinearScratch,
-}
-
-impl Workspace {
-    pub(crate) fn new() -> Self {
-        Self {
-            encode: EncodeBuffers::new(),
-            dit: DitBuffers::new(),
-            embodiment_ids: Vec::new(),
-            seen_state: Activations::new(),
-            state_hidden: Activations::new(),
-            state: Activations::new(),
-            x: Activations::new(),
-            start: Activations::new(),
-            strength: Activations::new(),
-            tokens: Activations::new(),
-            encoded: Activations::new(),
-            output: Activations::new(),
-            decoder_hidden: Activations::new(),
-            decoded: Activations::new(),
-            velocity: Activations::new(),
-            linear: LinearScratch::new(),
-        }
-    }
 }

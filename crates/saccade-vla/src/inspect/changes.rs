@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::collections::btree_map::Entry;
 
-use saccade_vla_kernels::LogitBias;
+use saccade_vla_kernels::{LogitBias, RowsMut};
 
 use super::check::{check, check_not_empty, is_read};
 use super::extent::Extent;
@@ -176,18 +176,25 @@ impl<'a> Changes<'a> {
         })
     }
 
-    /// Replaces rows after `block` at `step`. `x` holds the rows from `first_row` on of `samples` sequences for each batch element.
-    pub(crate) fn patch(&self, step: usize, block: usize, first_row: usize, samples: usize, x: &mut [f32]) {
+    /// Replaces rows after `block` at `step`. `x` has the rows from `first_row` on of each sequence, of which there are
+    /// `samples` for each observation.
+    pub(crate) fn patch(
+        &self,
+        step: usize,
+        block: usize,
+        first_row: usize,
+        samples: usize,
+        mut x: RowsMut<'_>,
+    ) {
         let Extent { groups, config, .. } = self.extent;
-        let width = config.width;
-        let sequence_len = (groups.num_rows() - first_row) * width;
+        let sequence_len = groups.num_rows() - first_row;
         let patches = self.patches.iter();
         for patch in patches.filter(|patch| (patch.step, patch.block) == (step, block)) {
-            for (index, sequence) in x.chunks_exact_mut(sequence_len).enumerate() {
-                let values = &patch.values[index / samples * patch.element_stride..];
-                for (row, value) in patch.rows.iter().zip(values.chunks_exact(width)) {
+            for sequence in 0..x.num_rows() / sequence_len {
+                let values = &patch.values[sequence / samples * patch.element_stride..];
+                for (row, value) in patch.rows.iter().zip(values.chunks_exact(config.width)) {
                     if let Some(row) = row.checked_sub(first_row) {
-                        sequence[row * width..(row + 1) * width].copy_from_slice(value);
+                        x.row_mut(sequence * sequence_len + row).copy_from_slice(value);
                     }
                 }
             }

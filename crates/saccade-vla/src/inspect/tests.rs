@@ -1,6 +1,6 @@
 //! What interventions mean, where they act, and what is refused.
 
-use saccade_vla_kernels::LogitBias;
+use saccade_vla_kernels::{LogitBias, RowsMut};
 
 use super::changes::Changes;
 use super::extent::Extent;
@@ -223,10 +223,10 @@ fn patches_replace_rows_of_every_sample() {
     let changes = changes(&config, &interventions).unwrap();
     let samples = 3;
     let mut x = vec![-1.0; 2 * samples * 6 * 4];
-    changes.patch(0, 2, 0, samples, &mut x);
-    changes.patch(1, 3, 0, samples, &mut x);
+    changes.patch(0, 2, 0, samples, RowsMut::new(&mut x, 4));
+    changes.patch(1, 3, 0, samples, RowsMut::new(&mut x, 4));
     assert!(x.iter().all(|&value| value == -1.0), "elsewhere");
-    changes.patch(1, 2, 0, samples, &mut x);
+    changes.patch(1, 2, 0, samples, RowsMut::new(&mut x, 4));
     for (index, sequence) in x.chunks_exact(6 * 4).enumerate() {
         let first = (index / samples * 8) as f32;
         assert_eq!(sequence[..4], [0.0, 1.0, 2.0, 3.0]);
@@ -235,7 +235,7 @@ fn patches_replace_rows_of_every_sample() {
         assert_eq!(sequence[20..], [0.0, 1.0, 2.0, 3.0].map(|value| first + value));
     }
     let mut actions = vec![-1.0; 2 * samples * 2 * 4];
-    changes.patch(1, 2, 4, samples, &mut actions);
+    changes.patch(1, 2, 4, samples, RowsMut::new(&mut actions, 4));
     for (sequence, actions) in x.chunks_exact(6 * 4).zip(actions.chunks_exact(2 * 4)) {
         assert_eq!(actions, &sequence[16..], "the action rows alone");
     }

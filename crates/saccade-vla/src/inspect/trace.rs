@@ -7,6 +7,7 @@ use crate::alloc::reserve;
 use crate::array::OwnedArray;
 use crate::error::{Error, Result, problem};
 use crate::ops::check_interrupted;
+use crate::options::setters;
 
 /// What to keep.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -19,16 +20,11 @@ pub struct Keep {
 }
 
 impl Keep {
-    /// Whether to keep attention probabilities.
-    #[must_use]
-    pub fn with_attention(self, attention: bool) -> Self {
-        Self { attention, ..self }
-    }
-
-    /// Whether to keep the rows after a block.
-    #[must_use]
-    pub fn with_hidden(self, hidden: bool) -> Self {
-        Self { hidden, ..self }
+    setters! {
+        /// Whether to keep attention probabilities.
+        with_attention(attention: bool);
+        /// Whether to keep the rows after a block.
+        with_hidden(hidden: bool);
     }
 }
 
@@ -79,7 +75,7 @@ impl<Key: Ord + Copy> Recorded<Key> {
     ///
     /// # Errors
     /// [`Error::Input`] if that is more than `max_bytes`, before anything is allocated; [`Error::Memory`] if the system refuses it.
-    pub(crate) fn claim(
+    pub(crate) fn allocate(
         argument: &str,
         record: Keep,
         keys: &[(Key, Shapes)],
@@ -98,7 +94,7 @@ impl<Key: Ord + Copy> Recorded<Key> {
             )));
         }
         // All is reserved before any of it is touched: what does not fit is refused at once.
-        let claim = |shape: &[usize]| {
+        let reserved = |shape: &[usize]| {
             let mut data: Vec<f32> = Vec::new();
             let elements = shape.iter().product(); // fits: it is below needed, which is at most max_bytes
             reserve("record", &mut data, elements).map_err(|_| Error::Memory {
@@ -110,10 +106,10 @@ impl<Key: Ord + Copy> Recorded<Key> {
         let (mut attention, mut hidden) = (Vec::new(), Vec::new());
         for (key, shapes) in keys {
             if record.attention {
-                attention.push((*key, claim(&shapes.attention)?));
+                attention.push((*key, reserved(&shapes.attention)?));
             }
             if record.hidden {
-                hidden.push((*key, claim(&shapes.hidden)?));
+                hidden.push((*key, reserved(&shapes.hidden)?));
             }
         }
         let zeros = |(key, (mut data, shape)): (Key, (Vec<f32>, Vec<usize>))| {
@@ -164,28 +160,13 @@ impl TraceOptions {
         }
     }
 
-    /// Of these blocks only; `None` means all.
-    #[must_use]
-    pub fn with_blocks(self, blocks: impl Into<Option<Vec<usize>>>) -> Self {
-        Self {
-            blocks: blocks.into(),
-            ..self
-        }
-    }
-
-    /// Of these Euler steps only; `None` means all.
-    #[must_use]
-    pub fn with_steps(self, steps: impl Into<Option<Vec<usize>>>) -> Self {
-        Self {
-            steps: steps.into(),
-            ..self
-        }
-    }
-
-    /// At most this many bytes.
-    #[must_use]
-    pub fn with_max_bytes(self, max_bytes: u64) -> Self {
-        Self { max_bytes, ..self }
+    setters! {
+        /// Of these blocks only; `None` means all.
+        with_blocks(blocks: impl Into<Option<Vec<usize>>>);
+        /// Of these Euler steps only; `None` means all.
+        with_steps(steps: impl Into<Option<Vec<usize>>>);
+        /// At most this many bytes.
+        with_max_bytes(max_bytes: u64);
     }
 
     /// The steps and blocks that are kept, of `num_steps` steps and `num_layers` blocks.
@@ -224,11 +205,11 @@ mod tests {
             })
         };
         let bytes = 2 * 4 * (2 * 3 * 4 * 5 + 2 * 4 * 7);
-        let recorded = Recorded::claim("max_bytes", BOTH, &keys(), bytes).unwrap();
+        let recorded = Recorded::allocate("max_bytes", BOTH, &keys(), bytes).unwrap();
         assert_eq!(recorded.attention[&2].shape(), [2, 3, 4, 5]);
         assert_eq!(recorded.hidden[&0].data().len(), 2 * 4 * 7);
         assert_eq!(
-            Recorded::claim("max_bytes", BOTH, &keys(), bytes - 1)
+            Recorded::allocate("max_bytes", BOTH, &keys(), bytes - 1)
                 .unwrap_err()
                 .to_string(),
             format!(
@@ -236,15 +217,15 @@ mod tests {
                 bytes - 1
             )
         );
-        let nothing = Recorded::claim("max_bytes", Keep::default(), &keys(), 0).unwrap();
+        let nothing = Recorded::allocate("max_bytes", Keep::default(), &keys(), 0).unwrap();
         assert!(nothing.attention.is_empty() && nothing.hidden.is_empty());
     }
 
     #[test]
     fn sizes_beyond_64_bits_are_refused() {
         let (attention, hidden) = ([1 << 20; 4], [1 << 20; 3]);
-        let error =
-            Recorded::claim("max_bytes", BOTH, &[(0, Shapes { attention, hidden })], u64::MAX).unwrap_err();
+        let error = Recorded::allocate("max_bytes", BOTH, &[(0, Shapes { attention, hidden })], u64::MAX)
+            .unwrap_err();
         let bytes = (1_u128 << 82) + (1 << 62);
         assert!(
             error

@@ -1,81 +1,52 @@
-//! Multi-head attention with its projections: what VL blocks, DiT blocks and the cross-attention on its own share.
+//! Multi-head attention with its projections: what the blocks of the head and the stand-alone cross-attention share.
 
-use saccade_vla_kernels::{Activations, Epilogue, LinearScratch, LogitBias, PackedKeyValues, Rows};
+use saccade_vla_kernels::{Epilogue, LogitBias, PackedKeyValues, Rows, RowsMut};
 
+use super::kv_cache;
 use super::linear::Linear;
+use super::sequences::Sequences;
 use super::weights::Weights;
-use crate::alloc::{collected, product, reserve, sized};
-use crate::engine::Engine;
+use crate::alloc::{Scratch, collected, product, reserve};
+use crate::engine::{Engine, Kernels};
 use crate::error::Result;
-use crate::ops::{self, no_keys_values, rows, rows_mut};
 use crate::precision::Role;
 use crate::profile::Part;
 
-/// `to_q`, `to_k` over `to_v`, `to_out`: `out(softmax(q k^T / sqrt(head_dim)) v)`, heads being contiguous slices.
+/// `to_out(softmax(to_q(y) to_k(c)^T / sqrt(head_dim)) to_v(c))`, whose heads are contiguous slices of a row.
 pub(crate) struct Attention {
     to_q: Linear,
+    /// `to_k` and `to_v`: one product makes both.
     to_kv: Linear,
     to_out: Linear,
     num_heads: usize,
     width: usize,
 }
 
-/// Memory of one attention call that is kept for the next.
-pub(crate) struct AttentionBuffers {
-    q: Activations,
-    kv: Activations,
-    mix: Activations,
+/// Memory kept between calls.
+#[derive(Default)]
+pub(crate) struct AttentionWorkspace {
+    q: Scratch,
+    kv: Scratch,
+    /// The values that each query attends to, before `to_out`.
+    mixed: Scratch,
     bias: Vec<f32>,
-    weights: Activations,
+    probabilities: Scratch,
     packed: Vec<PackedKeyValues>,
-    /// For the linear layers around the attention too: they run one after the other.
-    pub linear: LinearScratch,
 }
 
-/// Keys and values of a self-attention that outlive the call.
-pub(crate) struct Held<'a> {
-    /// One for each sequence; calls with fewer sequences leave the rest unused.
-    pub sequences: &'a mut Vec<PackedKeyValues>,
-    /// The number of keys that stay as they are; the others are computed from the given rows.
-    pub first: usize,
-}
-
-impl AttentionBuffers {
-    pub(crate) fn new() -> Self {
-        Self {
-            q: Activations::new(),
-            kv: Activations::new(),
-            mix: Activations::new(),
-            bias: Vec::new(),
-            weights: Activations::new(),
-            packed: Vec::new(),
-            linear: LinearScratch::new(),
-        }
-    }
-}
-
-/// Keys and values that queries are given, one for each group of sequences.
-#[derive(Clone, Copy)]
+/// What cross-attention attends to.
 pub(crate) struct CrossKeys<'a> {
-    pub packed: &'a [PackedKeyValues],
-    /// Sequences of queries for each, of equally many rows.
-    pub samples: usize,
-    /// The keys that each has, where these are not all.
+    /// The KV cache of each group of sequences.
+    pub caches: &'a [PackedKeyValues],
+    /// The keys that each group has, where these are not all.
     pub subset: Option<Subset<'a>>,
     pub bias: Bias<'a>,
+    /// Receives the softmax, `(sequences, heads, queries, keys)`; takes one sequence in each group. Of a subset, it
+    /// is over all keys, and zero before.
+    pub probabilities: Option<&'a mut [f32]>,
 }
 
-/// The rows from which a self-attention makes its keys and values.
-pub(crate) struct SelfKeys<'a> {
-    /// `(sequences, rows, width)`.
-    pub source: &'a [f32],
-    pub sequences: usize,
-    /// Where they outlive the call.
-    pub held: Option<Held<'a>>,
-    pub bias: Bias<'a>,
-}
-
-/// The keys that each group of queries has, where these are not all.
+/// The keys that each group of sequences has, where these are not all.
 #[derive(Clone, Copy)]
 pub(crate) struct Subset<'a> {
     /// By group, ascending.
@@ -84,7 +55,26 @@ pub(crate) struct Subset<'a> {
     pub all: usize,
 }
 
-/// What is added to the logits of an attention over several groups of keys.
+/// What self-attention attends to.
+pub(crate) struct SelfKeys<'a> {
+    /// The rows that keys and values are made of.
+    pub source: Sequences<'a>,
+    /// Where keys and values outlive the call.
+    pub held: Option<Held<'a>>,
+    pub bias: Bias<'a>,
+    /// Receives the softmax, `(sequences, heads, queries, keys)`.
+    pub probabilities: Option<&'a mut [f32]>,
+}
+
+/// KV caches of a self-attention that outlive the call.
+pub(crate) struct Held<'a> {
+    /// One for each sequence; calls with fewer sequences leave the rest unused.
+    pub caches: &'a mut Vec<PackedKeyValues>,
+    /// The number of keys that stay as they are; those of the given rows follow.
+    pub first: usize,
+}
+
+/// Biases of the logits.
 #[derive(Clone, Copy, Debug, Default)]
 pub(crate) struct Bias<'a> {
     /// `(groups, keys)`: each group's own, for all of its heads and queries.
@@ -94,42 +84,19 @@ pub(crate) struct Bias<'a> {
 }
 
 impl Bias<'_> {
-    /// The shared bias of `[heads, queries, keys]` logits at `positions` of the keys that it is over; `chosen` is memory for it.
-    fn at<'s>(
-        &self,
-        positions: &[usize],
-        [heads, queries, keys]: [usize; 3],
-        chosen: &'s mut Vec<f32>,
-    ) -> Result<Option<LogitBias<'s>>> {
-        let Some(shared) = self.shared else {
-            return Ok(None);
-        };
-        let heads = if shared.head_stride == 0 { 1 } else { heads };
-        chosen.clear();
-        let len = product("activations", &[heads, queries, keys])?;
-        reserve("activations", chosen, len)?;
-        for (head, query) in (0..heads).flat_map(|head| (0..queries).map(move |query| (head, query))) {
-            let row = &shared.values[head * shared.head_stride + query * shared.query_stride..];
-            chosen.extend(positions.iter().map(|&position| row[position]));
-        }
-        Ok(Some(LogitBias {
-            values: chosen,
-            head_stride: if heads == 1 { 0 } else { queries * keys },
-            query_stride: keys,
-        }))
-    }
-
-    /// The bias of `[heads, queries, keys]` logits of one group; `sum` is memory for the sum of both kinds.
+    /// The bias of `[heads, queries, keys]` logits of one group, whose keys are those at `positions` of the shared
+    /// bias, if only some are there. `memory` is for one that has to be computed.
     fn of<'s>(
         &'s self,
         group: usize,
+        positions: Option<&[usize]>,
         [heads, queries, keys]: [usize; 3],
-        sum: &'s mut Vec<f32>,
+        memory: &'s mut Vec<f32>,
     ) -> Result<Option<LogitBias<'s>>> {
         let own = self.keys.map(|all| &all[group * keys..(group + 1) * keys]);
-        let (own, shared) = match (own, self.shared) {
-            (Some(own), Some(shared)) => (own, shared),
-            (Some(values), None) => {
+        let shared = match (own, self.shared) {
+            (_, Some(shared)) if own.is_some() || positions.is_some() => shared,
+            (Some(values), _) => {
                 return Ok(Some(LogitBias {
                     values,
                     head_stride: 0,
@@ -139,15 +106,18 @@ impl Bias<'_> {
             (None, shared) => return Ok(shared),
         };
         let heads = if shared.head_stride == 0 { 1 } else { heads };
-        sum.clear();
+        memory.clear();
         let len = product("activations", &[heads, queries, keys])?;
-        reserve("activations", sum, len)?;
+        reserve("activations", memory, len)?;
         for (head, query) in (0..heads).flat_map(|head| (0..queries).map(move |query| (head, query))) {
-            let row = &shared.values[head * shared.head_stride + query * shared.query_stride..][..keys];
-            sum.extend(row.iter().zip(own).map(|(shared, own)| shared + own));
+            let row = &shared.values[head * shared.head_stride + query * shared.query_stride..];
+            memory.extend((0..keys).map(|key| {
+                let shared = row[positions.map_or(key, |positions| positions[key])];
+                own.map_or(shared, |own| shared + own[key])
+            }));
         }
         Ok(Some(LogitBias {
-            values: sum,
+            values: memory,
             head_stride: if heads == 1 { 0 } else { queries * keys },
             query_stride: keys,
         }))
@@ -181,195 +151,170 @@ impl Attention {
         self.width
     }
 
-    fn head_dim(&self) -> usize {
-        self.width / self.num_heads
+    fn empty_cache(&self, engine: Engine) -> PackedKeyValues {
+        kv_cache::empty(engine, self.num_heads, self.width / self.num_heads)
     }
 
-    fn scale(&self) -> f32 {
-        1.0 / (self.head_dim() as f32).sqrt()
-    }
-
-    /// Keys and values of `source`, whose rows are those of one group after the other, `counts` of each: one [`PackedKeyValues`] a group.
+    /// The KV caches of `source`, whose rows are those of one group after the other, `counts` of each.
     pub(crate) fn project(
         &self,
-        engine: Engine,
-        source: &[f32],
+        kernels: &mut Kernels<'_>,
+        source: Rows<'_>,
         counts: &[usize],
-        buffer: &mut Activations,
-        scratch: &mut LinearScratch,
+        kv: &mut Scratch,
     ) -> Result<Vec<PackedKeyValues>> {
-        let (keys, values) = self.keys_values(engine, source, buffer, scratch)?;
+        let (keys, values) = self.keys_values(kernels, source, kv)?;
         let mut first = 0;
-        let mut all = collected("keys and values", counts.len(), [])?;
+        let mut caches = collected("keys and values", counts.len(), [])?;
         for &count in counts {
-            let mut packed = no_keys_values(engine, self.num_heads, self.head_dim());
-            let new = first..first + count;
-            let (keys, values) = (keys.rows(new.clone()), values.rows(new));
-            ops::pack(engine.threads, &mut packed, 0, keys, values)?;
-            first += count;
-            all.push(packed);
+            let mut cache = self.empty_cache(kernels.engine);
+            let own = first..first + count;
+            first = own.end;
+            let (keys, values) = (keys.rows(own.clone()), values.rows(own));
+            kv_cache::replace_from(kernels.engine, &mut cache, 0, keys, values)?;
+            caches.push(cache);
         }
-        Ok(all)
+        Ok(caches)
     }
 
     fn keys_values<'a>(
         &self,
-        engine: Engine,
-        source: &[f32],
-        buffer: &'a mut Activations,
-        scratch: &mut LinearScratch,
+        kernels: &mut Kernels<'_>,
+        source: Rows<'_>,
+        kv: &'a mut Scratch,
     ) -> Result<(Rows<'a>, Rows<'a>)> {
-        let both = self.to_kv.out_features();
-        let buffer = sized(buffer, source.len() / self.to_kv.in_features() * both)?; // (rows, keys | values)
-        self.to_kv
-            .apply(engine, source, Epilogue::Store, buffer, scratch)?;
-        let both_rows = rows(buffer, both);
-        Ok((both_rows.columns(0..both / 2), both_rows.columns(both / 2..both)))
+        let both = kv.rows(source.num_rows(), 2 * self.width)?;
+        self.to_kv.apply(kernels, source, Epilogue::Store, both)?;
+        let both = kv.as_rows();
+        Ok((
+            both.columns(0..self.width),
+            both.columns(self.width..2 * self.width),
+        ))
     }
 
-    /// `softmax(to_q(y) keys^T) values`, to be projected by [`Self::out`]. `weights`, where asked for, is
-    /// `(sequences, heads, queries, keys)`; it takes one sequence for each of the keys. Where these are a subset, a shared bias and `weights`
-    /// are over all that it is chosen from, and `weights` is zero before.
-    pub(crate) fn mix_cross(
+    /// `out = epilogue(to_out(softmax(to_q(y) keys^T / sqrt(head_dim)) values))`. As many sequences of `y` as there
+    /// are for each KV cache attend to the same one.
+    pub(crate) fn cross(
         &self,
-        engine: Engine,
-        y: &[f32],
+        kernels: &mut Kernels<'_>,
+        y: Sequences<'_>,
         keys: CrossKeys<'_>,
-        mut weights: Option<&mut [f32]>,
-        buffers: &mut AttentionBuffers,
+        workspace: &mut AttentionWorkspace,
+        epilogue: Epilogue,
+        out: RowsMut<'_>,
     ) -> Result<()> {
         let CrossKeys {
-            packed,
-            samples,
+            caches,
             subset,
             bias,
+            mut probabilities,
         } = keys;
-        let width = self.width;
-        self.queries(engine, y, buffers)?;
-        // A shared bias is one sequence's, so each sequence is then a call of its own; otherwise those that read the same keys share one.
-        let calls = if bias.shared.is_some() { samples } else { 1 };
-        let count = buffers.q.len() / width / packed.len() / calls; // query rows of a call
-        let mix = sized(&mut buffers.mix, buffers.q.len())?;
-        for call in 0..packed.len() * calls {
-            let (group, kv) = (call / calls, &packed[call / calls]);
-            let range = call * count * width..(call + 1) * count * width;
-            let logits = [self.num_heads, count, kv.len()];
-            let q = rows(&buffers.q[range.clone()], width);
-            let mix = rows_mut(&mut mix[range], width);
-            let Some(Subset { positions, all }) = subset else {
-                let bias = bias.of(group, logits, &mut buffers.bias)?;
-                let weights = weights_of(&mut weights, call, logits);
-                ops::attention(engine.threads, q, kv, self.scale(), bias.into(), weights, mix)?;
-                continue;
-            };
-            let positions = &positions[group];
-            let bias = bias.at(positions, logits, &mut buffers.bias)?;
-            let mut chosen = match weights {
-                Some(_) => Some(sized(&mut buffers.weights, logits.iter().product())?),
-                None => None,
-            };
-            let seen = chosen.as_deref_mut();
-            ops::attention(engine.threads, q, kv, self.scale(), bias.into(), seen, mix)?;
-            let all_weights = weights_of(&mut weights, call, [self.num_heads, count, all]);
-            if let (Some(all_weights), Some(chosen)) = (all_weights, chosen) {
-                spread(chosen, positions, all_weights, all);
+        self.queries(kernels, y, workspace)?;
+        let (q, mut mixed) = (workspace.q.as_rows(), workspace.mixed.as_rows_mut());
+        // A shared bias is one sequence's, so each sequence is then a call of its own; otherwise those that read the
+        // same keys share one.
+        let of_group = y.count / caches.len();
+        let together = if bias.shared.is_some() { 1 } else { of_group };
+        for first in (0..y.count).step_by(together) {
+            let group = first / of_group;
+            let (cache, rows) = (&caches[group], y.range(first..first + together));
+            let positions = subset.map(|subset| subset.positions[group].as_slice());
+            let logits = [self.num_heads, rows.len(), cache.len()];
+            let bias = bias.of(group, positions, logits, &mut workspace.bias)?;
+            let all = subset.map_or(cache.len(), |subset| subset.all);
+            let own = of_sequence(
+                &mut probabilities,
+                first / together,
+                [self.num_heads, rows.len(), all],
+            );
+            let (q, mixed) = (q.rows(rows.clone()), mixed.reborrow().rows(rows));
+            match (positions, own) {
+                (Some(positions), Some(own)) => {
+                    let chosen = workspace.probabilities.slice(logits.iter().product())?;
+                    kv_cache::attend(kernels.engine, q, cache, bias.into(), Some(&mut *chosen), mixed)?;
+                    spread(chosen, positions, own, all);
+                }
+                (_, own) => kv_cache::attend(kernels.engine, q, cache, bias.into(), own, mixed)?,
             }
         }
-        Ok(())
+        self.to_out.apply(kernels, mixed.as_rows(), epilogue, out)
     }
 
-    /// `softmax(to_q(y) keys^T) values` within each sequence, to be projected by [`Self::out`]; `weights` is
-    /// `(sequences, heads, queries, keys)`. Keys and values that are held are kept, and where it says so added to those already there.
-    pub(crate) fn mix_self(
+    /// `x += to_out(softmax(to_q(y) keys^T / sqrt(head_dim)) values)` within each sequence.
+    pub(crate) fn add_self(
         &self,
-        engine: Engine,
-        y: &[f32],
+        kernels: &mut Kernels<'_>,
+        y: Sequences<'_>,
         keys: SelfKeys<'_>,
-        mut weights: Option<&mut [f32]>,
-        buffers: &mut AttentionBuffers,
+        workspace: &mut AttentionWorkspace,
+        x: RowsMut<'_>,
     ) -> Result<()> {
         let SelfKeys {
             source,
-            sequences,
             held,
             bias,
+            mut probabilities,
         } = keys;
-        let width = self.width;
-        self.queries(engine, y, buffers)?;
-        let count = buffers.q.len() / width / sequences; // query rows of a sequence
-        let mix = sized(&mut buffers.mix, buffers.q.len())?;
-        let (keys, values) = self.keys_values(engine, source, &mut buffers.kv, &mut buffers.linear)?;
-        let new = keys.num_rows() / sequences; // rows of a sequence whose keys and values these are
-        // Those that are not held use the same memory one after the other.
-        let (packed, distinct, first) = match held {
-            None => (&mut buffers.packed, 1, 0),
-            Some(held) => (held.sequences, sequences, held.first),
+        let engine = kernels.engine;
+        self.queries(kernels, y, workspace)?;
+        let (keys, values) = self.keys_values(kernels, source.rows, &mut workspace.kv)?;
+        let (q, mut mixed) = (workspace.q.as_rows(), workspace.mixed.as_rows_mut());
+        // Caches that are not held use the same memory one after the other.
+        let (caches, distinct, first) = match held {
+            None => (&mut workspace.packed, 1, 0),
+            Some(held) => (held.caches, y.count, held.first),
         };
-        reserve("keys and values", packed, distinct)?;
-        while packed.len() < distinct {
-            packed.push(no_keys_values(engine, self.num_heads, self.head_dim()));
+        reserve("keys and values", caches, distinct)?;
+        while caches.len() < distinct {
+            caches.push(self.empty_cache(engine));
         }
-        let logits = [self.num_heads, count, first + new];
-        for sequence in 0..sequences {
-            let packed = &mut packed[sequence % distinct];
-            let new = sequence * new..(sequence + 1) * new;
-            let (keys, values) = (keys.rows(new.clone()), values.rows(new));
-            ops::pack(engine.threads, packed, first, keys, values)?;
-            let range = sequence * count * width..(sequence + 1) * count * width;
-            ops::attention(
-                engine.threads,
-                rows(&buffers.q[range.clone()], width),
-                packed,
-                self.scale(),
-                bias.of(sequence, logits, &mut buffers.bias)?.into(),
-                weights_of(&mut weights, sequence, logits),
-                rows_mut(&mut mix[range], width),
-            )?;
+        let logits = [self.num_heads, y.len, first + source.len];
+        for sequence in 0..y.count {
+            let cache = &mut caches[sequence % distinct];
+            let new = source.range(sequence..sequence + 1);
+            kv_cache::replace_from(engine, cache, first, keys.rows(new.clone()), values.rows(new))?;
+            let bias = bias.of(sequence, None, logits, &mut workspace.bias)?;
+            let own = of_sequence(&mut probabilities, sequence, logits);
+            let rows = y.range(sequence..sequence + 1);
+            let (q, mixed) = (q.rows(rows.clone()), mixed.reborrow().rows(rows));
+            kv_cache::attend(engine, q, cache, bias.into(), own, mixed)?;
         }
-        Ok(())
+        self.to_out.apply(kernels, mixed.as_rows(), Epilogue::Add, x)
     }
 
-    /// `x = epilogue(to_out(mix))` of what [`Self::mix_cross`] or [`Self::mix_self`] has left in `buffers`.
-    pub(crate) fn out(
+    /// `to_q(y)` to `workspace.q`, and `workspace.mixed` of the same shape.
+    fn queries(
         &self,
-        engine: Engine,
-        epilogue: Epilogue,
-        buffers: &mut AttentionBuffers,
-        x: &mut [f32],
+        kernels: &mut Kernels<'_>,
+        y: Sequences<'_>,
+        workspace: &mut AttentionWorkspace,
     ) -> Result<()> {
-        let AttentionBuffers { mix, linear, .. } = buffers;
-        self.to_out.apply(engine, mix, epilogue, x, linear)
-    }
-
-    fn queries(&self, engine: Engine, y: &[f32], buffers: &mut AttentionBuffers) -> Result<()> {
-        let q = sized(&mut buffers.q, y.len())?;
-        self.to_q
-            .apply(engine, y, Epilogue::Store, q, &mut buffers.linear)
+        workspace.mixed.rows(y.rows.num_rows(), self.width)?;
+        let q = workspace.q.rows(y.rows.num_rows(), self.width)?;
+        self.to_q.apply(kernels, y.rows, Epilogue::Store, q)
     }
 }
 
-/// Rows over keys at `positions` among `all`, written to rows over all of them.
-fn spread(chosen: &[f32], positions: &[usize], all_weights: &mut [f32], all: usize) {
+/// Writes rows over the keys at `positions` among `all` to rows over all of them.
+fn spread(chosen: &[f32], positions: &[usize], all_keys: &mut [f32], all: usize) {
     if positions.is_empty() {
         return;
     }
-    for (chosen, row) in chosen
-        .chunks_exact(positions.len())
-        .zip(all_weights.chunks_exact_mut(all))
-    {
-        for (&weight, &position) in chosen.iter().zip(positions) {
-            row[position] = weight;
+    let rows = chosen.chunks_exact(positions.len());
+    for (chosen, row) in rows.zip(all_keys.chunks_exact_mut(all)) {
+        for (&probability, &position) in chosen.iter().zip(positions) {
+            row[position] = probability;
         }
     }
 }
 
-/// The probabilities of one sequence among those of all.
-fn weights_of<'a>(
+/// The `[heads, queries, keys]` probabilities of one sequence among those of all.
+fn of_sequence<'a>(
     all: &'a mut Option<&mut [f32]>,
     sequence: usize,
-    logits: [usize; 3],
+    shape: [usize; 3],
 ) -> Option<&'a mut [f32]> {
-    let size: usize = logits.iter().product();
+    let size: usize = shape.iter().product();
     all.as_deref_mut()
         .map(|all| &mut all[sequence * size..(sequence + 1) * size])
 }
@@ -397,7 +342,8 @@ mod tests {
                 query_stride: 2,
             }),
         };
-        let mut of = |bias: Bias<'_>, group| rows(bias.of(group, [2, 2, 2], &mut sum).unwrap().unwrap());
+        let mut of =
+            |bias: Bias<'_>, group| rows(bias.of(group, None, [2, 2, 2], &mut sum).unwrap().unwrap());
         assert_eq!(
             of(bias(None, 4), 1),
             [[10.0, 20.0], [30.0, 40.0], [50.0, 60.0], [70.0, 80.0]]
@@ -416,6 +362,11 @@ mod tests {
             shared: None,
         };
         assert_eq!(of(keys_only, 0), [[1.0, 2.0]; 4]);
-        assert!(Bias::default().of(0, [2, 2, 2], &mut sum).unwrap().is_none());
+        assert!(
+            Bias::default()
+                .of(0, None, [2, 2, 2], &mut sum)
+                .unwrap()
+                .is_none()
+        );
     }
 }

@@ -1,17 +1,18 @@
-//! Self-attention of language and vision models: fewer heads of keys than of queries, norms of both, rotary positions, a causal mask.
+//! Self-attention of language and vision models: heads of queries that share heads of keys, norms of both, rotary
+//! positions, a causal mask.
 
 use std::ops::Range;
 
-use saccade_vla_kernels::{Activations, Epilogue, LinearScratch, Mask, PackedKeyValues, Rows};
+use saccade_vla_kernels::{Epilogue, Mask, PackedKeyValues, Rows, RowsMut};
 
+use super::kv_cache;
 use super::linear::Linear;
-use super::rms_norm::RmsNorm;
-use super::rope::Rotation;
+use super::norm::RmsNorm;
+use super::rope::Rope;
 use super::weights::Weights;
-use crate::alloc::sized;
-use crate::engine::Engine;
+use crate::alloc::Scratch;
+use crate::engine::{Engine, Kernels};
 use crate::error::Result;
-use crate::ops::{self, no_keys_values, rows, rows_mut};
 use crate::precision::Role;
 use crate::profile::Part;
 
@@ -34,7 +35,7 @@ pub(crate) struct Projections {
     pub out_bias: bool,
 }
 
-/// The names of what makes queries, keys and values.
+/// The names of the projections to queries, keys and values.
 #[derive(Clone, Copy)]
 pub(crate) enum Qkv {
     Separate([&'static str; 3]),
@@ -42,23 +43,25 @@ pub(crate) enum Qkv {
     Stacked(&'static str),
 }
 
-/// Which rows attend to which.
-pub(crate) enum Sequences<'a, 'b> {
-    /// Sequences of this many rows, one after the other: a row attends to all of its own sequence.
+/// The rows that a row attends to.
+pub(crate) enum Attended<'a, 'b> {
+    /// Those of its own sequence: sequences of this many rows, one after the other.
     Whole(&'a [usize]),
-    /// Sequences one after the other: a row attends to itself and to the rows before it.
+    /// Itself and those before it in its sequence: sequences one after the other.
     Causal(&'a mut [Causal<'b>]),
 }
 
-/// A sequence whose keys and values outlive the call.
+/// A sequence whose KV cache outlives the call.
 pub(crate) struct Causal<'a> {
-    /// Those of earlier rows; those of the given rows are added, if they may be attended to.
-    pub held: &'a mut PackedKeyValues,
-    /// For each of the given rows whether rows may attend to it. A row that finds nothing to attend to gets zeros from the attention.
+    /// Holds keys and values of earlier rows; those of the given rows are appended, if they may be attended to.
+    pub cache: &'a mut PackedKeyValues,
+    /// For each of the given rows whether rows may attend to it. A row that finds nothing to attend to gets zeros
+    /// from the attention.
     pub attended: &'a [bool],
 }
 
-/// `o_proj(softmax(q k^T / sqrt(head_dim)) v)` with `q = rotate(norm(q_proj y))`, `k = rotate(norm(k_proj y))` and `v = v_proj y`.
+/// `o_proj(softmax(q k^T / sqrt(head_dim)) v)` with `q = rope(norm(q_proj y))`, `k = rope(norm(k_proj y))` and
+/// `v = v_proj y`.
 pub(crate) struct GroupedAttention {
     qkv: Linear,
     out: Linear,
@@ -67,11 +70,12 @@ pub(crate) struct GroupedAttention {
     sizes: GroupedSizes,
 }
 
-/// Memory of one call that is kept for the next.
+/// Memory kept between calls.
 #[derive(Default)]
-pub(crate) struct GroupedBuffers {
-    qkv: Activations,
-    mix: Activations,
+pub(crate) struct GroupedWorkspace {
+    /// Queries, keys and values side by side.
+    qkv: Scratch,
+    mixed: Scratch,
     packed: Option<PackedKeyValues>,
 }
 
@@ -83,13 +87,7 @@ impl GroupedAttention {
         projections: Projections,
         norm_eps: Option<f32>,
     ) -> Result<Self> {
-        let GroupedSizes {
-            width,
-            num_heads,
-            num_kv_heads,
-            head_dim,
-        } = sizes;
-        let (queries, keys) = (num_heads * head_dim, num_kv_heads * head_dim);
+        let [queries, keys, _] = sizes.columns().map(|columns| columns.len());
         let parts = match projections.qkv {
             Qkv::Separate([q_proj, k_proj, v_proj]) => vec![
                 (weights.at(q_proj), queries),
@@ -98,14 +96,12 @@ impl GroupedAttention {
             ],
             Qkv::Stacked(qkv) => vec![(weights.at(qkv), queries + 2 * keys)],
         };
-        let qkv = Linear::stacked(&parts, width, Role::BackboneBlock, projections.qkv_bias)?;
-        let out = [(weights.at(projections.out), width)];
+        let qkv = Linear::stacked(&parts, sizes.width, Role::BackboneBlock, projections.qkv_bias)?;
+        let out = [(weights.at(projections.out), sizes.width)];
         let out = Linear::stacked(&out, queries, Role::BackboneBlock, projections.out_bias)?;
+        let norm = |name, eps| RmsNorm::new(&weights.at(name), sizes.head_dim, eps);
         let norms = match norm_eps {
-            Some(eps) => Some([
-                RmsNorm::new(&weights.at("q_norm"), head_dim, eps)?,
-                RmsNorm::new(&weights.at("k_norm"), head_dim, eps)?,
-            ]),
+            Some(eps) => Some([norm("q_norm", eps)?, norm("k_norm", eps)?]),
             None => None,
         };
         Ok(Self {
@@ -116,63 +112,74 @@ impl GroupedAttention {
         })
     }
 
-    /// `x += attention(y)` over the rows of all sequences, both `(rows, width)`.
+    /// `x += attention(y)` over the rows of all sequences.
     pub(crate) fn add(
         &self,
-        engine: Engine,
-        y: &[f32],
-        rotation: Option<&Rotation>,
-        sequences: Sequences<'_, '_>,
-        (buffers, scratch): (&mut GroupedBuffers, &mut LinearScratch),
-        x: &mut [f32],
+        kernels: &mut Kernels<'_>,
+        y: Rows<'_>,
+        rope: Option<&Rope>,
+        attended: Attended<'_, '_>,
+        workspace: &mut GroupedWorkspace,
+        x: RowsMut<'_>,
     ) -> Result<()> {
-        let GroupedSizes {
-            width,
-            num_heads,
-            num_kv_heads,
-            head_dim,
-        } = self.sizes;
-        let (queries, keys) = (num_heads * head_dim, num_kv_heads * head_dim);
-        let (count, all) = (y.len() / width, queries + 2 * keys);
-        let qkv = sized(&mut buffers.qkv, count * all)?; // (rows, queries | keys | values)
-        self.qkv.apply(engine, y, Epilogue::Store, qkv, scratch)?;
-        for (index, columns) in [0..queries, queries..queries + keys].into_iter().enumerate() {
+        let engine = kernels.engine;
+        let [queries, keys, values] = self.sizes.columns();
+        let mut qkv = workspace.qkv.rows(y.num_rows(), values.end)?;
+        self.qkv.apply(kernels, y, Epilogue::Store, qkv.reborrow())?;
+        for (index, columns) in [&queries, &keys].into_iter().enumerate() {
+            let mut heads = qkv.reborrow().columns(columns.clone());
             if let Some(norms) = &self.norms {
-                norms[index].apply_to_heads(engine, rows_mut(qkv, all).columns(columns.clone()))?;
+                norms[index].apply_to_heads(engine, heads.reborrow())?;
             }
-            if let Some(rotation) = rotation {
-                rotation.apply(engine, rows_mut(qkv, all).columns(columns))?;
+            if let Some(rope) = rope {
+                rope.apply(engine, heads)?;
             }
         }
-        let qkv = rows(qkv, all);
-        let mix = sized(&mut buffers.mix, count * queries)?; // (rows, num_heads * head_dim)
+        let qkv = qkv.as_rows();
         let mut attend = Attend {
             engine,
-            queries: qkv.columns(0..queries),
-            keys: qkv.columns(queries..queries + keys),
-            values: qkv.columns(queries + keys..all),
-            scale: 1.0 / (head_dim as f32).sqrt(),
-            mix,
+            mixed: workspace.mixed.rows(y.num_rows(), queries.len())?,
+            queries: qkv.columns(queries),
+            keys: qkv.columns(keys),
+            values: qkv.columns(values),
         };
         let mut first = 0;
-        match sequences {
-            Sequences::Whole(lens) => {
-                let packed = buffers
+        match attended {
+            Attended::Whole(lens) => {
+                let GroupedSizes {
+                    num_kv_heads,
+                    head_dim,
+                    ..
+                } = self.sizes;
+                let packed = workspace
                     .packed
-                    .get_or_insert_with(|| no_keys_values(engine, num_kv_heads, head_dim));
+                    .get_or_insert_with(|| kv_cache::empty(engine, num_kv_heads, head_dim));
                 for len in lens {
                     attend.whole(first..first + len, packed)?;
                     first += len;
                 }
             }
-            Sequences::Causal(sequences) => {
+            Attended::Causal(sequences) => {
                 for sequence in sequences {
                     attend.causal(first, sequence)?;
                     first += sequence.attended.len();
                 }
             }
         }
-        self.out.apply(engine, mix, Epilogue::Add, x, scratch)
+        self.out.apply(kernels, attend.mixed.as_rows(), Epilogue::Add, x)
+    }
+}
+
+impl GroupedSizes {
+    /// The columns of queries, keys and values side by side.
+    fn columns(&self) -> [Range<usize>; 3] {
+        let queries = self.num_heads * self.head_dim;
+        let keys = self.num_kv_heads * self.head_dim;
+        [
+            0..queries,
+            queries..queries + keys,
+            queries + keys..queries + 2 * keys,
+        ]
     }
 }
 
@@ -182,44 +189,40 @@ struct Attend<'a> {
     queries: Rows<'a>,
     keys: Rows<'a>,
     values: Rows<'a>,
-    scale: f32,
-    mix: &'a mut [f32],
+    mixed: RowsMut<'a>,
 }
 
 impl Attend<'_> {
     /// A sequence whose rows all attend to each other; `packed` is memory for it.
     fn whole(&mut self, rows: Range<usize>, packed: &mut PackedKeyValues) -> Result<()> {
         let (keys, values) = (self.keys.rows(rows.clone()), self.values.rows(rows.clone()));
-        ops::pack(self.engine.threads, packed, 0, keys, values)?;
+        kv_cache::replace_from(self.engine, packed, 0, keys, values)?;
         self.attend(rows, packed, Mask::None)
     }
 
-    /// A causal sequence, whose rows begin with number `first`: run by run of rows that may be attended to, or may not.
-    fn causal(&mut self, first: usize, Causal { held, attended }: &mut Causal<'_>) -> Result<()> {
-        let mut start = 0;
+    /// A causal sequence, whose rows begin with number `first`: run by run of rows that may be attended to, or may
+    /// not.
+    fn causal(&mut self, first: usize, Causal { cache, attended }: &mut Causal<'_>) -> Result<()> {
+        let mut start = first;
         for run in attended.chunk_by(|a, b| a == b) {
-            let rows = first + start..first + start + run.len();
-            start += run.len();
-            let before = held.len();
+            let rows = start..start + run.len();
+            start = rows.end;
+            let before = cache.len();
             if run[0] {
                 let (keys, values) = (self.keys.rows(rows.clone()), self.values.rows(rows.clone()));
-                ops::append(self.engine.threads, held, keys, values)?;
-                self.attend(rows, held, Mask::Causal { offset: before })?;
+                kv_cache::append(self.engine, cache, keys, values)?;
             } else if before == 0 {
-                let width = self.queries.num_columns();
-                self.mix[rows.start * width..rows.end * width].fill(0.0);
-            } else {
-                // All of them see the same keys.
-                self.attend(rows, held, Mask::Causal { offset: before })?;
+                self.mixed.reborrow().rows(rows).fill(0.0);
+                continue;
             }
+            // Rows that were not appended all see the same keys.
+            self.attend(rows, cache, Mask::Causal { offset: before })?;
         }
         Ok(())
     }
 
-    fn attend(&mut self, range: Range<usize>, kv: &PackedKeyValues, mask: Mask<'_>) -> Result<()> {
-        let width = self.queries.num_columns();
-        let mixed = rows_mut(&mut self.mix[range.start * width..range.end * width], width);
-        let queries = self.queries.rows(range);
-        ops::attention(self.engine.threads, queries, kv, self.scale, mask, None, mixed)
+    fn attend(&mut self, rows: Range<usize>, cache: &PackedKeyValues, mask: Mask<'_>) -> Result<()> {
+        let mixed = self.mixed.reborrow().rows(rows.clone());
+        kv_cache::attend(self.engine, self.queries.rows(rows), cache, mask, None, mixed)
     }
 }

@@ -1,13 +1,13 @@
 //! Linear layers: `x W^T + b`, one or several of the same input packed as one.
 
-use saccade_vla_kernels::{Epilogue, LinearScratch, PackedLinear};
+use saccade_vla_kernels::{Epilogue, PackedLinear, Rows, RowsMut};
 
 use super::weights::Weights;
-use crate::engine::Engine;
+use crate::engine::Kernels;
 use crate::error::Result;
-use crate::ops;
+use crate::ops::{check_interrupted, refused};
 use crate::precision::Role;
-use crate::profile::Part;
+use crate::profile::{Part, counted_by};
 
 /// A linear layer: `weight (out_features, in_features)` and, if it has one, `bias (out_features)`.
 pub(crate) struct Linear {
@@ -90,15 +90,21 @@ impl Linear {
         self.packed.out_features()
     }
 
-    /// `out = epilogue(x W^T + b)` for rows `x (rows, in_features)` and `out (rows, out_features)`.
+    /// `out = epilogue(x W^T + b)`.
     pub(crate) fn apply(
         &self,
-        engine: Engine,
-        x: &[f32],
+        kernels: &mut Kernels<'_>,
+        x: Rows<'_>,
         epilogue: Epilogue,
-        out: &mut [f32],
-        scratch: &mut LinearScratch,
+        out: RowsMut<'_>,
     ) -> Result<()> {
-        ops::linear(self.part, &self.packed, engine.threads, x, epilogue, out, scratch)
+        let Self { packed, part } = self;
+        let multiply_adds = x.num_rows() * packed.in_features() * packed.out_features();
+        let work = (multiply_adds, packed.nbytes());
+        let applied = counted_by(Some(packed.kernel_name()), *part, work, || {
+            packed.apply(kernels.engine.threads, x, epilogue, out, kernels.scratch)
+        });
+        applied.map_err(refused("activations"))?;
+        check_interrupted()
     }
 }

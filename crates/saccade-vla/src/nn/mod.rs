@@ -3,12 +3,12 @@
 pub(crate) mod attention;
 pub(crate) mod embedding;
 pub(crate) mod feed_forward;
-pub(crate) mod gated_mlp;
 pub(crate) mod grouped_attention;
+pub(crate) mod kv_cache;
 pub(crate) mod linear;
 pub(crate) mod norm;
-pub(crate) mod rms_norm;
 pub(crate) mod rope;
+pub(crate) mod sequences;
 pub(crate) mod source;
 #[cfg(test)]
 mod tests;

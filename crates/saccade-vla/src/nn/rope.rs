@@ -1,23 +1,17 @@
-//! Rotary position embedding: the angles of positions.
+//! Rotary position embedding (RoPE): the angles of positions.
 
-use saccade_vla_kernels::RowsMut;
+use saccade_vla_kernels::{Rows, RowsMut};
 
 use crate::alloc::{product, reserve};
 use crate::engine::Engine;
 use crate::error::Result;
-use crate::ops::{self, rows};
+use crate::ops::kernel;
+use crate::profile::Part;
 
-/// Cosines and sines of the angles by which the pairs of each row are rotated, `(rows, pairs)`.
-pub(crate) struct Rotation {
-    cos: Vec<f32>,
-    sin: Vec<f32>,
-    pairs: usize,
-    head_dim: usize,
-}
-
-/// What turns a pair of a head: a position on one axis of a row, times a frequency.
+/// The angle by which a pair of elements of a head is rotated, as a function of the row's position:
+/// `position[axis] * frequency`.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(crate) struct Turn {
+pub(crate) struct RopePair {
     pub axis: usize,
     pub frequency: f32,
 }
@@ -27,27 +21,36 @@ pub(crate) fn frequencies(base: f64, pairs: usize) -> impl Iterator<Item = f32> 
     (0..pairs).map(move |pair| base.powf(-(pair as f64) / pairs as f64) as f32)
 }
 
-/// All pairs of heads of `head_dim`, turned by the only axis.
-pub(crate) fn one_axis(base: f64, head_dim: usize) -> Vec<Turn> {
-    let turn = |frequency| Turn { axis: 0, frequency };
-    frequencies(base, head_dim / 2).map(turn).collect()
+/// All pairs of heads of `head_dim`, rotated by a position with one axis.
+pub(crate) fn one_axis(base: f64, head_dim: usize) -> Vec<RopePair> {
+    let pair = |frequency| RopePair { axis: 0, frequency };
+    frequencies(base, head_dim / 2).map(pair).collect()
 }
 
-impl Rotation {
-    /// Angle `position * frequency` for the pairs of heads of `head_dim`, of which those with a turn are rotated; `positions` has the axes of
-    /// each row. Angles are float32 as in released code; the functions are evaluated in float64 and rounded once.
+/// Cosines and sines of the angles by which the pairs of each row are rotated, `(rows, pairs)`.
+pub(crate) struct Rope {
+    cos: Vec<f32>,
+    sin: Vec<f32>,
+    num_pairs: usize,
+    head_dim: usize,
+}
+
+impl Rope {
+    /// The angles of the first `pairs` of heads of `head_dim`, whose other elements stay as they are, for rows at
+    /// `positions`. Angles are float32 as in released code; their cosines and sines are evaluated in float64 and
+    /// rounded once.
     pub(crate) fn new<const AXES: usize>(
         head_dim: usize,
-        turns: &[Turn],
+        pairs: &[RopePair],
         positions: &[[usize; AXES]],
     ) -> Result<Self> {
-        let len = product("rotary embedding", &[positions.len(), turns.len()])?;
+        let len = product("rotary embedding", &[positions.len(), pairs.len()])?;
         let (mut cos, mut sin) = (Vec::new(), Vec::new());
         reserve("rotary embedding", &mut cos, len)?;
         reserve("rotary embedding", &mut sin, len)?;
         for position in positions {
-            for turn in turns {
-                let angle = f64::from(position[turn.axis] as f32 * turn.frequency);
+            for pair in pairs {
+                let angle = f64::from(position[pair.axis] as f32 * pair.frequency);
                 cos.push(angle.cos() as f32);
                 sin.push(angle.sin() as f32);
             }
@@ -55,14 +58,16 @@ impl Rotation {
         Ok(Self {
             cos,
             sin,
-            pairs: turns.len(),
+            num_pairs: pairs.len(),
             head_dim,
         })
     }
 
     /// Rotates each head of each row in place.
     pub(crate) fn apply(&self, engine: Engine, x: RowsMut<'_>) -> Result<()> {
-        let (cos, sin) = (rows(&self.cos, self.pairs), rows(&self.sin, self.pairs));
-        ops::rotary_embedding(engine, x, self.head_dim, cos, sin)
+        let [cos, sin] = [&self.cos, &self.sin].map(|table| Rows::new(table, self.num_pairs));
+        kernel(Some(Part::Pack), (0, 0), || {
+            saccade_vla_kernels::rotary_embedding(engine.isa, engine.threads, x, self.head_dim, cos, sin);
+        })
     }
 }

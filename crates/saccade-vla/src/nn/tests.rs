@@ -4,21 +4,21 @@ use std::collections::BTreeMap;
 use std::path::Path;
 
 use saccade_vla_checkpoint::Checkpoint;
-use saccade_vla_kernels::{Activations, Epilogue, Isa, LinearScratch};
+use saccade_vla_kernels::{Epilogue, Isa, LinearScratch, Rows, RowsMut};
 
 use super::feed_forward::{DIFFUSERS, FeedForward};
-use super::gated_mlp::GatedMlp;
 use super::grouped_attention::{
-    Causal, GroupedAttention, GroupedBuffers, GroupedSizes, Projections, Qkv, Sequences,
+    Attended, Causal, GroupedAttention, GroupedSizes, GroupedWorkspace, Projections, Qkv,
 };
+use super::kv_cache;
 use super::linear::Linear;
-use super::rms_norm::RmsNorm;
-use super::rope::{Rotation, one_axis};
+use super::norm::RmsNorm;
+use super::rope::{Rope, one_axis};
+use super::source::memory::{ElementsRef, MemorySource, TensorView, TensorViews};
 use super::weights::{Builder, Weights};
-use crate::engine::Engine;
+use crate::alloc::Scratch;
+use crate::engine::{Engine, Kernels};
 use crate::error::Result;
-use crate::nn::source::memory::{ElementsRef, MemorySource, TensorView, TensorViews};
-use crate::ops::no_keys_values;
 use crate::precision::{Precision, Role};
 
 /// Numbers that look random and are the same everywhere, below 1 in size.
@@ -146,12 +146,42 @@ fn linear_layers_without_a_bias() {
     };
     for (engine, layer) in named.layers(stacked) {
         let mut out = vec![0.0; 4 * 8];
-        let scratch = &mut LinearScratch::new();
+        let mut scratch = LinearScratch::new();
+        let kernels = &mut Kernels::new(engine, &mut scratch);
+        let rows = RowsMut::new(&mut out, 8);
         layer
-            .apply(engine, &x, Epilogue::Store, &mut out, scratch)
+            .apply(kernels, Rows::new(&x, 7), Epilogue::Store, rows)
             .unwrap();
         assert_close(&out, &expected, &engine.isa.to_string());
     }
+}
+
+/// Checks that `add(engine, layer, y, x)` gives `expected` for `y` and `x (rows, width)`, on each instruction set.
+fn assert_adds<L>(
+    layers: Vec<(Engine, L)>,
+    (y, x, width): (&[f32], &[f32], usize),
+    expected: &[f64],
+    what: &str,
+    add: impl Fn(&mut Kernels<'_>, &L, Rows<'_>, RowsMut<'_>) -> Result<()>,
+) {
+    for (engine, layer) in layers {
+        let mut out = x.to_vec();
+        let mut scratch = LinearScratch::new();
+        let kernels = &mut Kernels::new(engine, &mut scratch);
+        let rows = RowsMut::new(&mut out, width);
+        add(kernels, &layer, Rows::new(y, width), rows).unwrap();
+        assert_close(&out, expected, &format!("{what} {}", engine.isa));
+    }
+}
+
+/// `layer.add` with memory of its own.
+fn add_feed_forward(
+    kernels: &mut Kernels<'_>,
+    layer: &FeedForward,
+    y: Rows<'_>,
+    x: RowsMut<'_>,
+) -> Result<()> {
+    layer.add(kernels, y, &mut Scratch::default(), x)
 }
 
 #[test]
@@ -177,15 +207,16 @@ fn feed_forwards_of_any_hidden_width_and_activation() {
             .iter_mut()
             .zip(&x)
             .for_each(|(sum, x)| *sum += f64::from(*x));
-        for (engine, layer) in
-            named.layers(|weights| FeedForward::new(weights, DIFFUSERS, [6, 11], activation, Role::Block))
-        {
-            let (mut out, scratch) = (x.clone(), &mut LinearScratch::new());
-            layer
-                .add(engine, &y, &mut Activations::new(), scratch, &mut out)
-                .unwrap();
-            assert_close(&out, &expected, &format!("{} {activation:?}", engine.isa));
-        }
+        let build =
+            |weights: &Weights<'_>| FeedForward::new(weights, DIFFUSERS, [6, 11], activation, Role::Block);
+        let what = format!("{activation:?}");
+        assert_adds(
+            named.layers(build),
+            (&y, &x, 6),
+            &expected,
+            &what,
+            add_feed_forward,
+        );
     }
 }
 
@@ -208,13 +239,8 @@ fn gated_layers_multiply_the_activated_gate() {
         .iter_mut()
         .zip(&x)
         .for_each(|(sum, x)| *sum += f64::from(*x));
-    for (engine, layer) in named.layers(|weights| GatedMlp::new(weights, 6, 9, Epilogue::Silu, false)) {
-        let (mut out, scratch) = (x.clone(), &mut LinearScratch::new());
-        layer
-            .add(engine, &y, &mut Activations::new(), scratch, &mut out)
-            .unwrap();
-        assert_close(&out, &expected, &engine.isa.to_string());
-    }
+    let layers = named.layers(|weights| FeedForward::gated(weights, [6, 9], Epilogue::Silu));
+    assert_adds(layers, (&y, &x, 6), &expected, "gated", add_feed_forward);
 }
 
 #[test]
@@ -225,7 +251,8 @@ fn rms_norms_of_rows() {
     rms_norm(&mut expected, &named.get("weight"), 1e-6);
     for (engine, norm) in named.layers(|weights| RmsNorm::new(weights, 13, 1e-6)) {
         let mut out = vec![0.0; x.len()];
-        norm.apply(engine, &x, &mut out).unwrap();
+        norm.apply(engine, Rows::new(&x, 13), RowsMut::new(&mut out, 13))
+            .unwrap();
         assert_close(&out, &expected, &engine.isa.to_string());
     }
 }
@@ -297,7 +324,7 @@ fn grouped_attention_with_norms_rotation_and_masks() {
     let attended: Vec<bool> = (0..count)
         .map(|row| ![0, 1, 5, 6, 20, 36].contains(&row))
         .collect();
-    let rotation = Rotation::new(4, &one_axis(base, 4), &positions).unwrap();
+    let rope = Rope::new(4, &one_axis(base, 4), &positions).unwrap();
     for (has_norms, is_rotated, is_causal) in [(true, true, true), (false, true, false), (true, false, true)]
     {
         let [mut q, mut k, v] =
@@ -324,29 +351,20 @@ fn grouped_attention_with_norms_rotation_and_masks() {
             .zip(&x)
             .for_each(|(sum, x)| *sum += f64::from(*x));
         let eps = has_norms.then_some(1e-6);
-        for (engine, layer) in
-            named.layers(|weights| GroupedAttention::new(weights, sizes, QWEN_WITH_BIAS, eps))
-        {
-            let (mut out, rotation) = (x.clone(), is_rotated.then_some(&rotation));
-            let memory = (&mut GroupedBuffers::default(), &mut LinearScratch::new());
-            let mut held = no_keys_values(engine, 2, 4);
+        let layers = named.layers(|weights| GroupedAttention::new(weights, sizes, QWEN_WITH_BIAS, eps));
+        let what = format!("{has_norms} {is_rotated}");
+        let rope = is_rotated.then_some(&rope);
+        assert_adds(layers, (&y, &x, 10), &expected, &what, |kernels, layer, y, x| {
             let causal = &mut [Causal {
-                held: &mut held,
+                cache: &mut kv_cache::empty(kernels.engine, 2, 4),
                 attended: &attended,
             }];
             let sequences = match is_causal {
-                true => Sequences::Causal(causal),
-                false => Sequences::Whole(&[count]),
+                true => Attended::Causal(causal),
+                false => Attended::Whole(&[count]),
             };
-            layer
-                .add(engine, &y, rotation, sequences, memory, &mut out)
-                .unwrap();
-            assert_close(
-                &out,
-                &expected,
-                &format!("{} {has_norms} {is_rotated}", engine.isa),
-            );
-        }
+            layer.add(kernels, y, rope, sequences, &mut GroupedWorkspace::default(), x)
+        });
     }
 }
 
@@ -363,19 +381,17 @@ fn released(name: &str) -> Named {
     Named(tensors.collect())
 }
 
-/// Checks `add(engine, layer, input, out)`, which adds the result to `out`, on each instruction set.
+/// Checks `add`, which adds the result for rows of `width` to `x`, on each instruction set.
 fn assert_released<L>(
     name: &str,
+    width: usize,
     build: impl Fn(&Weights<'_>) -> Result<L>,
-    add: impl Fn(Engine, &L, &[f32], &mut [f32]) -> Result<()>,
+    add: impl Fn(&mut Kernels<'_>, &L, Rows<'_>, RowsMut<'_>) -> Result<()>,
 ) {
     let named = released(name);
     let (input, expected) = (&named.0["input"].1, named.get("output"));
-    for (engine, layer) in named.layers(build) {
-        let mut out = vec![0.0; expected.len()];
-        add(engine, &layer, input, &mut out).unwrap();
-        assert_close(&out, &expected, &format!("{name} {}", engine.isa));
-    }
+    let zeros = vec![0.0; expected.len()];
+    assert_adds(named.layers(build), (input, &zeros, width), &expected, name, add);
 }
 
 #[test]
@@ -391,28 +407,31 @@ fn the_layers_of_qwen_are_those_of_transformers() {
         ..QWEN_WITH_BIAS
     };
     let positions: Vec<[usize; 1]> = (5..16).map(|position| [position]).collect();
-    let rotation = Rotation::new(8, &one_axis(1e6, 8), &positions).unwrap();
+    let rope = Rope::new(8, &one_axis(1e6, 8), &positions).unwrap();
     assert_released(
         "qwen3.self_attn",
+        20,
         |weights| GroupedAttention::new(weights, sizes, projections, Some(1e-6)),
-        |engine, layer, y, x| {
-            let memory = (&mut GroupedBuffers::default(), &mut LinearScratch::new());
+        |kernels, layer, y, x| {
             let causal = &mut [Causal {
-                held: &mut no_keys_values(engine, 2, 8),
+                cache: &mut kv_cache::empty(kernels.engine, 2, 8),
                 attended: &[true; 11],
             }];
-            layer.add(engine, y, Some(&rotation), Sequences::Causal(causal), memory, x)
+            let (sequences, workspace) = (Attended::Causal(causal), &mut GroupedWorkspace::default());
+            layer.add(kernels, y, Some(&rope), sequences, workspace, x)
         },
     );
     assert_released(
         "qwen3.mlp",
-        |weights| GatedMlp::new(weights, 20, 28, Epilogue::Silu, false),
-        |engine, layer, y, x| layer.add(engine, y, &mut Activations::new(), &mut LinearScratch::new(), x),
+        20,
+        |weights| FeedForward::gated(weights, [20, 28], Epilogue::Silu),
+        add_feed_forward,
     );
     assert_released(
         "qwen3.norm",
+        20,
         |weights| RmsNorm::new(weights, 20, 1e-6),
-        |engine, layer, y, x| layer.apply(engine, y, x),
+        |kernels, layer, y, x| layer.apply(kernels.engine, y, x),
     );
 }
 
@@ -432,15 +451,17 @@ fn the_layers_of_siglip_are_those_of_transformers() {
     };
     assert_released(
         "siglip.self_attn",
+        24,
         |weights| GroupedAttention::new(weights, sizes, projections, None),
-        |engine, layer, y, x| {
-            let memory = (&mut GroupedBuffers::default(), &mut LinearScratch::new());
-            layer.add(engine, y, None, Sequences::Whole(&[11]), memory, x)
+        |kernels, layer, y, x| {
+            let workspace = &mut GroupedWorkspace::default();
+            layer.add(kernels, y, None, Attended::Whole(&[11]), workspace, x)
         },
     );
     assert_released(
         "siglip.mlp",
+        24,
         |weights| FeedForward::new(weights, ["fc1", "fc2"], [24, 36], Epilogue::GeluTanh, Role::Block),
-        |engine, layer, y, x| layer.add(engine, y, &mut Activations::new(), &mut LinearScratch::new(), x),
+        add_feed_forward,
     );
 }

@@ -9,7 +9,7 @@ use saccade_vla_checkpoint::{Elements, TensorSpec};
 use saccade_vla_kernels::{Matrix, PackedLinear, WeightRef, quantize_rows};
 
 use crate::alloc::{collected, filled, product};
-use crate::array::{first_not_finite, unravel};
+use crate::array::{OwnedArray, first_not_finite, first_where, unravel};
 use crate::engine::Engine;
 use crate::error::{Error, Result, problem, show_shape};
 use crate::ops::{check_interrupted, packing_error};
@@ -198,9 +198,18 @@ impl<'a> Builder<'a> {
         }
     }
 
-    /// Bytes of all that was built.
-    pub(crate) fn nbytes(&self) -> usize {
-        self.nbytes.get()
+    /// The layers that `build` makes of a source, and their bytes.
+    ///
+    /// # Errors
+    /// Those of `build`.
+    pub(crate) fn build<L>(
+        source: &'a dyn Source,
+        engine: Engine,
+        build: impl FnOnce(&Weights<'_>) -> Result<L>,
+    ) -> Result<(L, usize)> {
+        let builder = Self::new(source, engine);
+        let layers = build(&builder.weights())?;
+        Ok((layers, builder.nbytes.get()))
     }
 }
 
@@ -260,15 +269,17 @@ impl Weights<'_> {
         self.bias(name, len)
     }
 
-    /// The first `count` rows of the table `weight`, kept as float32. Empty if the source gives an outline.
-    pub(crate) fn table(&self, shape: [usize; 2], count: usize) -> Result<Vec<f32>> {
+    /// The first `count` rows of the table `weight`, kept as float32. None if the source gives an outline.
+    pub(crate) fn table(&self, shape: [usize; 2], count: usize) -> Result<OwnedArray> {
         self.count(4 * count * shape[1]);
         let table = self.read(Request {
             spec: TensorSpec::plain(&self.name("weight"), &shape),
             slices: (count != shape[0]).then_some(0..count),
             is_given_back: false,
         })?;
-        table.into_f32()
+        let table = table.into_f32()?;
+        let rows = if table.is_empty() { 0 } else { count };
+        OwnedArray::new(table, &[rows, shape[1]])
     }
 
     /// The table `weight`, whose rows are looked up: as int8 with a scale for each row if that is what is computed in, in bf16 if that is
@@ -389,7 +400,7 @@ fn check_finite(request: &Request, elements: &Elements) -> Result<()> {
             None => return Ok(()),
             Some(position) => (position, values[position]),
         },
-        Elements::Bf16(values) => match first_not_finite_bf16(values) {
+        Elements::Bf16(values) => match first_where(values, |value| !value.is_finite()) {
             None => return Ok(()),
             Some(position) => (position, values[position].to_f32()),
         },
@@ -403,15 +414,4 @@ fn check_finite(request: &Request, elements: &Elements) -> Result<()> {
         &spec.name; expected "finite weights";
         got "{value} at index {}", show_shape(&unravel(first * slice + position, &spec.shape))
     )))
-}
-
-fn first_not_finite_bf16(values: &[bf16]) -> Option<usize> {
-    const TOGETHER: usize = 4096;
-    const EXPONENT: u16 = 0x7f80;
-    let is_bad = |value: &bf16| value.to_bits() & EXPONENT == EXPONENT;
-    let chunk = values
-        .chunks(TOGETHER)
-        .position(|chunk| chunk.iter().fold(false, |bad, value| bad | is_bad(value)))?;
-    let within = values[chunk * TOGETHER..].iter().position(is_bad)?;
-    Some(chunk * TOGETHER + within)
 }

@@ -1,8 +1,11 @@
 //! Real-time chunking (spec 5.2): a chunk begins with the end of the previous one.
 
+use saccade_vla_kernels::{Rows, RowsMut};
+
 use crate::array::Array;
 use crate::config::HeadConfig;
 use crate::error::{Error, Result, problem, show_shape};
+use crate::options::setters;
 
 /// The chunk before, and how it is taken over. Of its first `horizon` actions the last `overlap` become the first ones of the new chunk, without
 /// noise: the first `frozen` of these stay as they are, the rest follow the velocity the more, the later they come.
@@ -47,13 +50,9 @@ impl<'a> Chunking<'a> {
         }
     }
 
-    /// With this number of actions of the previous chunk.
-    #[must_use]
-    pub fn with_horizon(self, horizon: impl Into<Option<usize>>) -> Self {
-        Self {
-            horizon: horizon.into(),
-            ..self
-        }
+    setters! {
+        /// With this number of actions of the previous chunk.
+        with_horizon(horizon: impl Into<Option<usize>>);
     }
 
     /// # Errors
@@ -106,17 +105,18 @@ impl<'a> Chunking<'a> {
 }
 
 impl Seam<'_> {
-    /// Writes what is taken over into chunks `x (batch, samples, horizon, width)`; what it is too narrow for becomes zero.
-    pub(crate) fn begin(&self, samples: usize, horizon: usize, width: usize, x: &mut [f32]) {
-        let (rows, given) = (self.previous.shape()[1], self.previous.shape()[2]);
-        for (index, chunk) in x.chunks_exact_mut(horizon * width).enumerate() {
-            let previous = &self.previous.data()[(index / samples * rows + self.first) * given..];
-            for (row, previous) in chunk
-                .chunks_exact_mut(width)
-                .zip(previous.chunks_exact(given))
-                .take(self.overlap)
-            {
-                let both = given.min(width);
+    /// Writes the actions that are taken over into chunks of `horizon` rows of `x`, `samples` for each observation. A
+    /// previous chunk that is narrower leaves zeros.
+    pub(crate) fn begin(&self, samples: usize, horizon: usize, mut x: RowsMut<'_>) {
+        let &[_, rows, width] = self.previous.shape() else {
+            return;
+        };
+        let previous = Rows::new(self.previous.data(), width);
+        let both = width.min(x.num_columns());
+        for chunk in 0..x.num_rows() / horizon {
+            for index in 0..self.overlap {
+                let previous = previous.row(chunk / samples * rows + self.first + index);
+                let row = x.row_mut(chunk * horizon + index);
                 row[..both].copy_from_slice(&previous[..both]);
                 row[both..].fill(0.0);
             }

@@ -1,8 +1,8 @@
 //! The integration of the velocity, from noise at flow time 0 to actions at flow time 1.
 
-use saccade_vla_kernels::Activations;
+use saccade_vla_kernels::{Rows, RowsMut};
 
-use crate::alloc::sized;
+use crate::alloc::Scratch;
 use crate::error::{Error, Result, problem};
 
 /// The scheme of one integration step of length `dt`, from `x` at flow time `t`, along the velocity `v`.
@@ -14,15 +14,6 @@ pub enum Integrator {
     Euler,
     /// `x + dt v(x + dt / 2 v(x, t), t + dt / 2)`: two evaluations of the velocity.
     Midpoint,
-}
-
-/// A velocity as the head computes it.
-pub(crate) struct Velocity<'a> {
-    /// `(chunks, action_horizon, action_dim)`.
-    pub values: &'a [f32],
-    pub action_dim: usize,
-    /// Factor of the velocity of each action of a chunk, `(action_horizon,)`.
-    pub strength: &'a [f32],
 }
 
 impl Integrator {
@@ -48,33 +39,30 @@ impl Integrator {
         }
     }
 
-    /// Moves `x (chunks, action_horizon, width)` along the velocity of evaluation number `index` of a step of length
-    /// `dt`. Elements beyond `action_dim` stay as they are. `start` holds `x` from the start of a step of two
-    /// evaluations.
+    /// Moves `x (actions, width)` along the velocity `v (actions, action_dim)` of evaluation number `index` of a step of
+    /// length `dt`. Elements beyond `action_dim` stay as they are. `strength` multiplies the velocity of each action of a
+    /// chunk; `start` holds `x` from the start of a step of two evaluations.
     pub(crate) fn advance(
         self,
         index: usize,
         dt: f32,
-        velocity: &Velocity<'_>,
-        x: &mut [f32],
-        width: usize,
-        start: &mut Activations,
+        v: Rows<'_>,
+        strength: &[f32],
+        mut x: RowsMut<'_>,
+        start: &mut Scratch,
     ) -> Result<()> {
         let dt = match (self, index) {
             (Self::Euler, _) => dt,
             (Self::Midpoint, 0) => {
-                sized(start, x.len())?.copy_from_slice(x);
+                start.rows(x.num_rows(), x.num_columns())?.copy_from(x.as_rows());
                 dt / 2.0
             }
             (Self::Midpoint, _) => {
-                x.copy_from_slice(start);
+                x.copy_from(start.as_rows());
                 dt
             }
         };
-        let rows = x
-            .chunks_exact_mut(width)
-            .zip(velocity.values.chunks_exact(velocity.action_dim));
-        for ((x, v), strength) in rows.zip(velocity.strength.iter().cycle()) {
+        for ((x, v), strength) in x.iter_mut().zip(v.iter()).zip(strength.iter().cycle()) {
             for (x, v) in x.iter_mut().zip(v) {
                 *x += dt * v * strength;
             }

@@ -1,20 +1,20 @@
 //! The blocks that both vision towers are made of: attention within a view, and a feed-forward layer.
 
-use saccade_vla_kernels::{Activations, Epilogue, LinearScratch};
+use saccade_vla_kernels::{Epilogue, RowsMut};
 
-use crate::alloc::sized;
+use crate::alloc::Scratch;
 use crate::backbone::config::VisionConfig;
-use crate::engine::Engine;
+use crate::engine::Kernels;
 use crate::error::Result;
 use crate::nn::feed_forward::FeedForward;
-use crate::nn::grouped_attention::{GroupedAttention, GroupedBuffers, GroupedSizes, Projections, Sequences};
+use crate::nn::grouped_attention::{Attended, GroupedAttention, GroupedSizes, GroupedWorkspace, Projections};
 use crate::nn::norm::LayerNorm;
-use crate::nn::rope::Rotation;
+use crate::nn::rope::Rope;
 use crate::nn::weights::Weights;
 use crate::precision::Role;
 
-/// What the parts of a block are called.
-pub(crate) struct BlockNames {
+/// The names of the parts of a block.
+pub(super) struct BlockNames {
     pub norms: [&'static str; 2],
     pub attention: &'static str,
     pub projections: Projections,
@@ -22,24 +22,30 @@ pub(crate) struct BlockNames {
 }
 
 /// `x += attention(norm1(x)); x += mlp(norm2(x))`.
-pub(crate) struct VisionBlock {
+pub(super) struct VisionBlock {
     norm1: LayerNorm,
     attention: GroupedAttention,
     norm2: LayerNorm,
     mlp: FeedForward,
 }
 
-/// Memory of one call that is kept for the next.
+/// Memory kept between calls.
 #[derive(Default)]
-pub(crate) struct BlockBuffers {
-    pub y: Activations,
-    pub hidden: Activations,
-    pub attention: GroupedBuffers,
-    pub linear: LinearScratch,
+pub(super) struct BlockWorkspace {
+    y: Scratch,
+    hidden: Scratch,
+    attention: GroupedWorkspace,
 }
 
 impl VisionBlock {
-    pub(crate) fn new(weights: &Weights<'_>, config: &VisionConfig, names: &BlockNames) -> Result<Self> {
+    /// The blocks below `weights`, by number.
+    pub(super) fn all(weights: &Weights<'_>, config: &VisionConfig, names: &BlockNames) -> Result<Vec<Self>> {
+        (0..config.num_layers)
+            .map(|index| Self::new(&weights.at(index), config, names))
+            .collect()
+    }
+
+    fn new(weights: &Weights<'_>, config: &VisionConfig, names: &BlockNames) -> Result<Self> {
         let (width, eps) = (config.width, config.norm_eps as f32);
         let sizes = GroupedSizes {
             width,
@@ -63,27 +69,22 @@ impl VisionBlock {
         })
     }
 
-    /// Runs the block over the patches `x (patches, width)` of views, of which there are `views` in each.
-    pub(crate) fn run(
+    /// Runs the block over the patches of views, of which there are `views` in each.
+    pub(super) fn run(
         &self,
-        engine: Engine,
-        rotation: Option<&Rotation>,
+        kernels: &mut Kernels<'_>,
+        rope: Option<&Rope>,
         views: &[usize],
-        buffers: &mut BlockBuffers,
-        x: &mut [f32],
+        workspace: &mut BlockWorkspace,
+        mut x: RowsMut<'_>,
     ) -> Result<()> {
-        let BlockBuffers {
-            y,
-            hidden,
-            attention,
-            linear,
-        } = buffers;
-        let y = sized(y, x.len())?;
-        self.norm1.apply(engine, x, y)?;
-        let memory = (attention, &mut *linear);
+        let BlockWorkspace { y, hidden, attention } = workspace;
+        let mut y = y.rows(x.num_rows(), x.num_columns())?;
+        self.norm1.apply(kernels.engine, x.as_rows(), y.reborrow())?;
+        let views = Attended::Whole(views);
         self.attention
-            .add(engine, y, rotation, Sequences::Whole(views), memory, x)?;
-        self.norm2.apply(engine, x, y)?;
-        self.mlp.add(engine, y, hidden, linear, x)
+            .add(kernels, y.as_rows(), rope, views, attention, x.reborrow())?;
+        self.norm2.apply(kernels.engine, x.as_rows(), y.reborrow())?;
+        self.mlp.add(kernels, y.as_rows(), hidden, x)
     }
 }

@@ -1,10 +1,11 @@
-//! From patches to tokens: squares of patches are joined, normed, and projected to the width of the language model.
+//! The connector between vision tower and language model: squares of patches are joined, normed, and projected to the
+//! width of the language model.
 
-use saccade_vla_kernels::{Activations, Epilogue, LinearScratch};
+use saccade_vla_kernels::{Epilogue, Rows, RowsMut};
 
-use crate::alloc::sized;
+use crate::alloc::{Scratch, filled, product};
 use crate::backbone::config::PatchOrder;
-use crate::engine::Engine;
+use crate::engine::Kernels;
 use crate::error::Result;
 use crate::nn::linear::Linear;
 use crate::nn::norm::LayerNorm;
@@ -13,37 +14,37 @@ use crate::precision::Role;
 use crate::profile::Part;
 
 /// `linear2(gelu(linear1(norm(x))))`, or one linear layer alone.
-pub(crate) struct Connector {
+pub(super) struct Connector {
     norm: Option<LayerNorm>,
     first: Linear,
     second: Option<Linear>,
 }
 
-/// What the parts of a connector are called.
-pub(crate) struct ConnectorNames {
+/// The names of the parts of a connector.
+pub(super) struct ConnectorNames {
     pub norm: &'static str,
     pub layers: [&'static str; 2],
 }
 
 /// The width of the norm and of the three sides of the two layers.
-pub(crate) struct ConnectorSizes {
+pub(super) struct ConnectorSizes {
+    /// The width of a patch, or that of the joined ones.
     pub norm: usize,
     pub input: usize,
     pub hidden: usize,
     pub output: usize,
 }
 
-/// Memory of one call that is kept for the next.
+/// Memory kept between calls.
 #[derive(Default)]
-pub(crate) struct ConnectorBuffers {
-    pub joined: Activations,
-    pub normed: Activations,
-    pub hidden: Activations,
+pub(super) struct ConnectorWorkspace {
+    normed: Scratch,
+    hidden: Scratch,
 }
 
 impl Connector {
     /// One linear layer, with a bias.
-    pub(crate) fn linear(weights: &Weights<'_>, input: usize, output: usize) -> Result<Self> {
+    pub(super) fn linear(weights: &Weights<'_>, input: usize, output: usize) -> Result<Self> {
         Ok(Self {
             norm: None,
             first: Linear::new(weights, input, output, Role::Other)?.counted(Part::Connector),
@@ -51,8 +52,8 @@ impl Connector {
         })
     }
 
-    /// A norm and two layers. The norm is over rows of `sizes.norm`, the width of a patch or of several that are joined.
-    pub(crate) fn new(
+    /// A norm and two layers.
+    pub(super) fn new(
         weights: &Weights<'_>,
         names: &ConnectorNames,
         sizes: &ConnectorSizes,
@@ -68,48 +69,57 @@ impl Connector {
         })
     }
 
-    /// The tokens `out (tokens, output)` of joined patches `x (tokens, input)`.
-    pub(crate) fn apply(
+    /// The tokens `(tokens, output)` of rows of the width of the norm, several of which make a token if that is the
+    /// width of a patch.
+    pub(super) fn tokens(
         &self,
-        engine: Engine,
-        x: &[f32],
-        (buffers, scratch): ([&mut Activations; 2], &mut LinearScratch),
-        out: &mut [f32],
-    ) -> Result<()> {
-        let [normed, hidden] = buffers;
+        kernels: &mut Kernels<'_>,
+        x: Rows<'_>,
+        workspace: &mut ConnectorWorkspace,
+    ) -> Result<Vec<f32>> {
+        let ConnectorWorkspace { normed, hidden } = workspace;
         let x = match &self.norm {
             Some(norm) => {
-                let normed = sized(normed, x.len())?;
-                norm.apply(engine, x, normed)?;
+                let normed_rows = normed.rows(x.num_rows(), x.num_columns())?;
+                norm.apply(kernels.engine, x, normed_rows)?;
                 normed
+                    .as_rows()
+                    .joined(self.first.in_features() / x.num_columns())
             }
             None => x,
         };
-        let Some(second) = &self.second else {
-            return self.first.apply(engine, x, Epilogue::Store, out, scratch);
-        };
-        let rows = x.len() / self.first.in_features();
-        let hidden = sized(hidden, rows * self.first.out_features())?;
-        self.first.apply(engine, x, Epilogue::GeluErf, hidden, scratch)?;
-        second.apply(engine, hidden, Epilogue::Store, out, scratch)
-    }
-
-    pub(crate) fn out_features(&self) -> usize {
-        self.second.as_ref().unwrap_or(&self.first).out_features()
+        let last = self.second.as_ref().unwrap_or(&self.first);
+        let len = product("tokens of views", &[x.num_rows(), last.out_features()])?;
+        let mut tokens = filled("tokens of views", len, 0.0)?;
+        let out = RowsMut::new(&mut tokens, last.out_features());
+        if self.second.is_none() {
+            self.first.apply(kernels, x, Epilogue::Store, out)?;
+        } else {
+            let mut hidden = hidden.rows(x.num_rows(), self.first.out_features())?;
+            self.first
+                .apply(kernels, x, Epilogue::GeluErf, hidden.reborrow())?;
+            last.apply(kernels, hidden.as_rows(), Epilogue::Store, out)?;
+        }
+        Ok(tokens)
     }
 }
 
-/// Joins the squares of `merge` patches on each side of a view `x (rows * columns, width)`, row by row, to
-/// `out (rows * columns / merge^2, merge^2 * width)`.
-pub(crate) fn join(merge: usize, order: PatchOrder, [rows, columns]: [usize; 2], x: &[f32], out: &mut [f32]) {
-    let (width, patches) = (x.len() / (rows * columns), merge * merge);
+/// Pixel shuffle: joins the squares of `merge` patches on each side of a view `x (rows * columns, width)`, row by row,
+/// to `out (rows * columns / merge^2, merge^2 * width)`.
+pub(super) fn pixel_shuffle(
+    merge: usize,
+    order: PatchOrder,
+    [rows, columns]: [usize; 2],
+    x: Rows<'_>,
+    mut out: RowsMut<'_>,
+) {
+    let (width, patches) = (x.num_columns(), merge * merge);
     let squares = (0..rows)
         .step_by(merge)
         .flat_map(|row| (0..columns).step_by(merge).map(move |column| [row, column]));
-    for ([row, column], out) in squares.zip(out.chunks_exact_mut(patches * width)) {
+    for ([row, column], out) in squares.zip(out.iter_mut()) {
         for inside in 0..patches {
-            let patch = (row + inside / merge) * columns + column + inside % merge;
-            let patch = &x[patch * width..][..width];
+            let patch = x.row((row + inside / merge) * columns + column + inside % merge);
             match order {
                 PatchOrder::PatchFirst => out[inside * width..][..width].copy_from_slice(patch),
                 PatchOrder::PatchLast => {

@@ -1,55 +1,68 @@
-//! The vision tower of a backbone: SigLIP's or that of Qwen3-VL, for views of which as many are encoded together as memory should hold.
+//! The vision tower of a backbone: SigLIP's or that of Qwen3-VL. Views are encoded in batches, bounded by the memory
+//! of their activations.
 
 mod block;
-pub(crate) mod buffers;
 mod connector;
-pub(crate) mod positions;
+mod positions;
 mod qwen3_vl;
 mod siglip;
+mod tower;
 
 use std::sync::Arc;
 
-use self::buffers::VisionBuffers;
+use saccade_vla_kernels::Rows;
+
 use self::qwen3_vl::Qwen3Vl;
 use self::siglip::Siglip;
-use crate::alloc::{collected, reserve};
-use crate::backbone::config::{BackboneConfig, Tower};
-use crate::backbone::features::View;
-use crate::backbone::inputs::{ViewPixels, num_tokens};
-use crate::backbone::released::Names;
-use crate::engine::Engine;
+use self::tower::VisionTower;
+pub(super) use self::tower::VisionWorkspace;
+use super::config::{BackboneConfig, Tower};
+use super::features::View;
+use super::inputs::{ViewPixels, num_tokens};
+use super::released::Names;
+use crate::alloc::{collected, copied, reserve};
+use crate::engine::Kernels;
 use crate::error::Result;
 use crate::nn::weights::Weights;
+use crate::ops::check_interrupted;
 
-/// Patches that are encoded together. More read the weights less often; fewer keep the activations small: at 2048 patches the weights are
-/// read once for 8 views, and the largest buffer is 35 MB at N1.5's size.
+/// Patches that are encoded together. More read the weights less often; fewer keep the activations small: at 2048
+/// patches the weights are read once for 8 views, and the largest buffer is 35 MB at N1.5's size.
 const VISION_ROWS: usize = 2048;
 
 /// A vision tower with its connector.
-pub(crate) enum Vision {
-    Siglip(Siglip),
-    Qwen3Vl(Qwen3Vl),
+pub(super) struct Vision(Box<dyn VisionTower + Send + Sync>);
+
+/// Encoded views, one after the other.
+struct EncodedViews<'a> {
+    /// The patches after the last block, and after the norm that follows if there is one.
+    patches: Rows<'a>,
+    /// `(tokens, width of the language model)`.
+    tokens: Vec<f32>,
+    /// The same, to be added after the first layers of the language model.
+    deepstack: Vec<Vec<f32>>,
 }
 
 impl Vision {
-    pub(crate) fn new(weights: &Weights<'_>, names: &Names, config: &BackboneConfig) -> Result<Self> {
-        Ok(match config.vision.tower {
+    pub(super) fn new(weights: &Weights<'_>, names: &Names, config: &BackboneConfig) -> Result<Self> {
+        Ok(Self(match config.vision.tower {
             Tower::Siglip { pixels, patches } => {
-                Self::Siglip(Siglip::new(weights, names, config, (pixels, patches))?)
+                Box::new(Siglip::new(weights, names, config, (pixels, patches))?)
             }
-            Tower::Qwen3Vl { .. } => Self::Qwen3Vl(Qwen3Vl::new(&weights.at(names.vision), config)?),
-        })
+            Tower::Qwen3Vl { .. } => Box::new(Qwen3Vl::new(&weights.at(names.vision), config)?),
+        }))
     }
 
     /// Encodes views, each by itself; `record` keeps their patches as well.
-    pub(crate) fn encode(
+    pub(super) fn encode(
         &self,
-        engine: Engine,
+        kernels: &mut Kernels<'_>,
         config: &BackboneConfig,
         views: &[ViewPixels<'_>],
         record: bool,
-        buffers: &mut VisionBuffers,
+        workspace: &mut VisionWorkspace,
     ) -> Result<Vec<Arc<View>>> {
+        let width = config.language.width;
         let mut encoded = Vec::new();
         reserve("views", &mut encoded, views.len())?;
         let mut left = views;
@@ -61,35 +74,25 @@ impl Vision {
             });
             let (group, rest) = left.split_at(together.count().max(1));
             left = rest;
-            let made = match self {
-                Self::Siglip(tower) => tower.encode(engine, group, buffers)?,
-                Self::Qwen3Vl(tower) => tower.encode(engine, group, buffers)?,
-            };
+            let made = self.encode_together(kernels, config, group, workspace)?;
             let (mut token, mut patch) = (0, 0);
             for view in group {
                 let num_tokens = num_tokens(&config.vision, view);
-                let tokens = token..token + num_tokens * config.language.width;
-                let patches = patch..patch + view.num_patches() * config.vision.width;
+                let (tokens, patches) = (token..token + num_tokens, patch..patch + view.num_patches());
                 (token, patch) = (tokens.end, patches.end);
-                let copy = |from: &[f32]| {
-                    let from = &from[tokens.clone()];
-                    collected("tokens of views", from.len(), from.iter().copied())
-                };
+                let own = |all| copied("tokens of views", Rows::new(all, width).rows(tokens.clone()));
                 encoded.push(Arc::new(View {
                     pixels: collected("pixel_values", view.pixels.len(), view.pixels.iter().copied())?,
                     grid: view.grid,
                     num_tokens,
-                    tokens: copy(&made.tokens)?,
+                    tokens: own(&made.tokens)?,
                     deepstack: made
                         .deepstack
                         .iter()
-                        .map(|rows| copy(rows))
+                        .map(|rows| own(rows))
                         .collect::<Result<_>>()?,
                     patches: match record {
-                        true => {
-                            let from = &self.patches(buffers)[patches];
-                            collected("record", from.len(), from.iter().copied())?
-                        }
+                        true => copied("record", made.patches.rows(patches))?,
                         false => Vec::new(),
                     },
                 }));
@@ -98,11 +101,37 @@ impl Vision {
         Ok(encoded)
     }
 
-    /// The patches after the last block, and after the norm that follows if there is one.
-    fn patches<'a>(&self, buffers: &'a VisionBuffers) -> &'a [f32] {
-        match self {
-            Self::Siglip(_) => &buffers.block.y,
-            Self::Qwen3Vl(_) => &buffers.x,
+    /// Encodes views in one batch.
+    fn encode_together<'a>(
+        &self,
+        kernels: &mut Kernels<'_>,
+        config: &BackboneConfig,
+        views: &[ViewPixels<'_>],
+        workspace: &'a mut VisionWorkspace,
+    ) -> Result<EncodedViews<'a>> {
+        let VisionWorkspace {
+            x,
+            patch_vectors,
+            block,
+            tokens,
+        } = workspace;
+        let counts: Vec<usize> = views.iter().map(ViewPixels::num_patches).collect();
+        let mut rows = x.rows(counts.iter().sum(), config.vision.width)?;
+        let rope = self.0.embed(kernels, views, patch_vectors, rows.reborrow())?;
+        let mut deepstack = Vec::new();
+        for (index, layer) in self.0.blocks().iter().enumerate() {
+            check_interrupted()?;
+            layer.run(kernels, rope.as_ref(), &counts, block, rows.reborrow())?;
+            if let Some(merger) = self.0.deepstack(index) {
+                let joined = rows.as_rows().joined(config.vision.patches_of_token());
+                deepstack.push(merger.tokens(kernels, joined, &mut tokens.connector)?);
+            }
         }
+        let (patches, tokens) = self.0.tokens(kernels, views, x.as_rows(), tokens)?;
+        Ok(EncodedViews {
+            patches,
+            tokens,
+            deepstack,
+        })
     }
 }

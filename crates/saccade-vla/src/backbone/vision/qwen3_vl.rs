@@ -1,19 +1,20 @@
 //! The vision tower of Qwen3-VL, which N1.7 has, with the mergers that make tokens of its patches.
 
-use saccade_vla_kernels::{Activations, Epilogue, LinearScratch};
+use saccade_vla_kernels::{Epilogue, Rows, RowsMut};
 
 use super::block::{BlockNames, VisionBlock};
-use super::buffers::{EncodedViews, VisionBuffers};
 use super::connector::{Connector, ConnectorNames, ConnectorSizes};
-use super::positions::{Taps, evenly_spaced, interpolate, patch_places, vision_turns};
-use crate::alloc::{reserve, sized};
+use super::positions::{Taps, evenly_spaced, interpolate, patch_places, vision_rope_pairs};
+use super::tower::{TokensWorkspace, VisionTower};
+use crate::alloc::{Scratch, reserve};
+use crate::array::OwnedArray;
 use crate::backbone::config::{BackboneConfig, CHANNELS, Tower, VisionConfig};
 use crate::backbone::inputs::ViewPixels;
-use crate::engine::Engine;
+use crate::engine::Kernels;
 use crate::error::Result;
 use crate::nn::grouped_attention::{Projections, Qkv};
 use crate::nn::linear::Linear;
-use crate::nn::rope::{Rotation, Turn};
+use crate::nn::rope::{Rope, RopePair};
 use crate::nn::weights::Weights;
 use crate::ops::check_interrupted;
 use crate::precision::Role;
@@ -37,20 +38,20 @@ const MERGER: ConnectorNames = ConnectorNames {
 };
 
 /// Patches, blocks, and the mergers of the last block and of those in `deepstack`.
-pub(crate) struct Qwen3Vl {
+pub(super) struct Qwen3Vl {
     patch_embed: Linear,
     /// `(positions, width)`, a square.
-    positions: Vec<f32>,
+    positions: OwnedArray,
     blocks: Vec<VisionBlock>,
     merger: Connector,
     deepstack_mergers: Vec<Connector>,
-    turns: Vec<Turn>,
+    rope_pairs: Vec<RopePair>,
     config: VisionConfig,
 }
 
 impl Qwen3Vl {
     /// From `patch_embed`, `pos_embed`, `blocks`, `merger` and `deepstack_merger_list`.
-    pub(crate) fn new(weights: &Weights<'_>, config: &BackboneConfig) -> Result<Self> {
+    pub(super) fn new(weights: &Weights<'_>, config: &BackboneConfig) -> Result<Self> {
         let vision = &config.vision;
         let (width, size) = (vision.width, vision.patch_size);
         let frames = match vision.tower {
@@ -61,10 +62,7 @@ impl Qwen3Vl {
         let patch_embed = Linear::windows(&weights.at("patch_embed.proj"), &shape, Role::Other)?;
         let positions = weights.at("pos_embed");
         let positions = positions.table([vision.num_positions, width], vision.num_positions)?;
-        let blocks: Result<_> = (0..vision.num_layers)
-            .map(|index| VisionBlock::new(&weights.at("blocks").at(index), vision, &BLOCK))
-            .collect();
-        let blocks = blocks?;
+        let blocks = VisionBlock::all(&weights.at("blocks"), vision, &BLOCK)?;
         let joined = vision.patches_of_token() * width;
         let merger = |weights: &Weights<'_>, norm| {
             let sizes = ConnectorSizes {
@@ -86,80 +84,64 @@ impl Qwen3Vl {
             // Normed patch by patch, the others token by token.
             merger: merger(&weights.at("merger"), width)?,
             deepstack_mergers: deepstack_mergers?,
-            turns: vision_turns(vision),
+            rope_pairs: vision_rope_pairs(vision),
             config: vision.clone(),
         })
     }
+}
 
-    /// The tokens of views.
-    pub(crate) fn encode(
-        &self,
-        engine: Engine,
-        views: &[ViewPixels<'_>],
-        buffers: &mut VisionBuffers,
-    ) -> Result<EncodedViews> {
-        let counts: Vec<usize> = views.iter().map(ViewPixels::num_patches).collect();
-        let (patches, width) = (counts.iter().sum::<usize>(), self.config.width);
-        let VisionBuffers {
-            x,
-            patch_vectors,
-            block,
-            connector,
-        } = buffers;
-        let x = sized(x, patches * width)?;
-        let rotation = self.embed(engine, views, patch_vectors, &mut block.linear, x)?;
-        let tokens = patches / self.config.patches_of_token() * self.merger.out_features();
-        let mut encoded = EncodedViews::new(tokens)?;
-        let mut mergers = self
-            .config
-            .deepstack
-            .iter()
-            .zip(&self.deepstack_mergers)
-            .peekable();
-        for (index, layer) in self.blocks.iter().enumerate() {
-            check_interrupted()?;
-            layer.run(engine, Some(&rotation), &counts, block, x)?;
-            if let Some((_, merger)) = mergers.next_if(|(after, _)| **after == index) {
-                let mut rows = EncodedViews::new(tokens)?.tokens;
-                let memory = ([&mut connector.normed, &mut connector.hidden], &mut block.linear);
-                merger.apply(engine, x, memory, &mut rows)?;
-                encoded.deepstack.push(rows);
-            }
-        }
-        let memory = ([&mut connector.normed, &mut connector.hidden], &mut block.linear);
-        self.merger.apply(engine, x, memory, &mut encoded.tokens)?;
-        Ok(encoded)
-    }
-
-    /// `x = patches W^T + b + positions`; the angles by which heads are rotated.
+impl VisionTower for Qwen3Vl {
     fn embed(
         &self,
-        engine: Engine,
+        kernels: &mut Kernels<'_>,
         views: &[ViewPixels<'_>],
-        patch_vectors: &mut Activations,
-        scratch: &mut LinearScratch,
-        x: &mut [f32],
-    ) -> Result<Rotation> {
-        let (width, side) = (self.config.width, self.config.table_side());
-        let rows = x.len() / width;
-        let patch_vectors = sized(patch_vectors, rows * self.patch_embed.in_features())?;
+        patch_vectors: &mut Scratch,
+        mut x: RowsMut<'_>,
+    ) -> Result<Option<Rope>> {
+        let (side, elements) = (self.config.table_side(), self.patch_embed.in_features());
+        let mut patch_vectors = patch_vectors.rows(x.num_rows(), elements)?;
         let mut places = Vec::new();
-        reserve("positions", &mut places, rows)?;
-        let mut rows = x.chunks_exact_mut(width);
-        let mut first = 0;
+        reserve("positions", &mut places, x.num_rows())?;
+        let mut rows = x.iter_mut();
         for view in views {
             check_interrupted()?;
-            patch_vectors[first..][..view.pixels.len()].copy_from_slice(view.pixels);
-            first += view.pixels.len();
+            let own = places.len()..places.len() + view.num_patches();
+            let mut vectors = patch_vectors.reborrow().rows(own);
+            vectors.copy_from(Rows::new(view.pixels, elements));
             let [by_row, by_column]: [Vec<Taps>; 2] = view.grid.map(|count| evenly_spaced(side, count));
             let of_view = patch_places(self.config.merge, view.grid)?;
             for ([row, column], x) in of_view.iter().zip(&mut rows) {
-                interpolate(&self.positions, side, [&by_row[*row], &by_column[*column]], x);
+                interpolate(
+                    self.positions.rows(),
+                    side,
+                    [&by_row[*row], &by_column[*column]],
+                    x,
+                );
             }
             places.extend(of_view);
         }
+        drop(rows);
         self.patch_embed
-            .apply(engine, patch_vectors, Epilogue::Add, x, scratch)?;
-        Rotation::new(self.config.head_dim, &self.turns, &places)
+            .apply(kernels, patch_vectors.as_rows(), Epilogue::Add, x)?;
+        Rope::new(self.config.head_dim, &self.rope_pairs, &places).map(Some)
+    }
+
+    fn blocks(&self) -> &[VisionBlock] {
+        &self.blocks
+    }
+
+    fn deepstack(&self, block: usize) -> Option<&Connector> {
+        let index = self.config.deepstack.iter().position(|after| *after == block)?;
+        self.deepstack_mergers.get(index)
+    }
+
+    fn tokens<'a>(
+        &self,
+        kernels: &mut Kernels<'_>,
+        _views: &[ViewPixels<'_>],
+        x: Rows<'a>,
+        workspace: &'a mut TokensWorkspace,
+    ) -> Result<(Rows<'a>, Vec<f32>)> {
+        Ok((x, self.merger.tokens(kernels, x, &mut workspace.connector)?))
     }
 }

@@ -1,20 +1,22 @@
 //! SigLIP, the vision tower of N1.5 and N1.6, with the connector behind it.
 
-use saccade_vla_kernels::{Activations, Epilogue, LinearScratch};
+use saccade_vla_kernels::{Epilogue, Rows, RowsMut};
 
 use super::block::{BlockNames, VisionBlock};
-use super::buffers::{EncodedViews, VisionBuffers};
-use super::connector::{Connector, ConnectorNames, ConnectorSizes, join};
+use super::connector::{Connector, ConnectorNames, ConnectorSizes, pixel_shuffle};
 use super::positions::{Taps, antialiased, interpolate};
-use crate::alloc::sized;
+use super::tower::{TokensWorkspace, VisionTower};
+use crate::alloc::Scratch;
+use crate::array::OwnedArray;
 use crate::backbone::config::{BackboneConfig, CHANNELS, PatchOrder, PixelOrder, VisionConfig};
 use crate::backbone::inputs::ViewPixels;
 use crate::backbone::released::Names;
-use crate::engine::Engine;
+use crate::engine::Kernels;
 use crate::error::Result;
 use crate::nn::grouped_attention::{Projections, Qkv};
 use crate::nn::linear::Linear;
 use crate::nn::norm::LayerNorm;
+use crate::nn::rope::Rope;
 use crate::nn::weights::Weights;
 use crate::ops::check_interrupted;
 use crate::precision::Role;
@@ -37,14 +39,14 @@ const CONNECTOR: ConnectorNames = ConnectorNames {
     layers: ["1", "3"],
 };
 
-/// What the connector's norm adds to the variance.
+/// Added to the variance in the connector's norm.
 const CONNECTOR_EPS: f32 = 1e-5;
 
 /// Patches, blocks, a norm, and the connector.
-pub(crate) struct Siglip {
+pub(super) struct Siglip {
     patch_embedding: Linear,
     /// `(positions, width)`, a square.
-    positions: Vec<f32>,
+    positions: OwnedArray,
     blocks: Vec<VisionBlock>,
     post_layernorm: LayerNorm,
     connector: Connector,
@@ -55,7 +57,7 @@ pub(crate) struct Siglip {
 
 impl Siglip {
     /// From `embeddings`, `encoder.layers` and `post_layernorm`, and from the connector.
-    pub(crate) fn new(
+    pub(super) fn new(
         weights: &Weights<'_>,
         names: &Names,
         config: &BackboneConfig,
@@ -73,11 +75,7 @@ impl Siglip {
             Linear::windows(&embeddings.at("patch_embedding"), &patch_embedding, Role::Other)?;
         let positions = embeddings.at("position_embedding");
         let positions = positions.table([vision.num_positions, width], vision.num_positions)?;
-        let layers = tower.at("encoder.layers");
-        let blocks: Result<_> = (0..vision.num_layers)
-            .map(|index| VisionBlock::new(&layers.at(index), vision, &BLOCK))
-            .collect();
-        let blocks = blocks?;
+        let blocks = VisionBlock::all(&tower.at("encoder.layers"), vision, &BLOCK)?;
         let post_layernorm = LayerNorm::new(&tower.at("post_layernorm"), width, vision.norm_eps as f32)?;
         let connector = weights.at(names.connector.unwrap_or_default());
         let (joined, output) = (vision.patches_of_token() * width, config.language.width);
@@ -103,85 +101,6 @@ impl Siglip {
             pixels,
             patches,
         })
-    }
-
-    /// The tokens of views, and their patches after the last norm.
-    pub(crate) fn encode(
-        &self,
-        engine: Engine,
-        views: &[ViewPixels<'_>],
-        buffers: &mut VisionBuffers,
-    ) -> Result<EncodedViews> {
-        let counts: Vec<usize> = views.iter().map(ViewPixels::num_patches).collect();
-        let (patches, width) = (counts.iter().sum::<usize>(), self.config.width);
-        let VisionBuffers {
-            x,
-            patch_vectors,
-            block,
-            connector,
-        } = buffers;
-        let x = sized(x, patches * width)?;
-        self.embed(engine, views, patch_vectors, &mut block.linear, x)?;
-        for layer in &self.blocks {
-            check_interrupted()?;
-            layer.run(engine, None, &counts, block, x)?;
-        }
-        let y = sized(&mut block.y, x.len())?;
-        self.post_layernorm.apply(engine, x, y)?;
-        let merge = self.config.merge;
-        let joined: &[f32] = match merge {
-            1 => y,
-            _ => {
-                let joined = sized(&mut connector.joined, y.len())?;
-                let mut first = 0;
-                for view in views {
-                    let range = first..first + view.num_patches() * width;
-                    join(
-                        merge,
-                        self.patches,
-                        view.grid,
-                        &y[range.clone()],
-                        &mut joined[range.clone()],
-                    );
-                    first = range.end;
-                }
-                joined
-            }
-        };
-        let tokens = patches / self.config.patches_of_token();
-        let mut encoded = EncodedViews::new(tokens * self.connector.out_features())?;
-        let memory = ([&mut connector.normed, &mut connector.hidden], &mut block.linear);
-        self.connector
-            .apply(engine, joined, memory, &mut encoded.tokens)?;
-        Ok(encoded)
-    }
-
-    /// `x = patches W^T + b + positions`.
-    fn embed(
-        &self,
-        engine: Engine,
-        views: &[ViewPixels<'_>],
-        patch_vectors: &mut Activations,
-        scratch: &mut LinearScratch,
-        x: &mut [f32],
-    ) -> Result<()> {
-        let (width, side) = (self.config.width, self.config.table_side());
-        let elements = self.patch_embedding.in_features();
-        let patch_vectors = sized(patch_vectors, x.len() / width * elements)?;
-        let mut vectors = patch_vectors.chunks_exact_mut(elements);
-        let mut rows = x.chunks_exact_mut(width);
-        for view in views {
-            check_interrupted()?;
-            self.cut(view, &mut vectors);
-            let [by_row, by_column]: [Vec<Taps>; 2] = view.grid.map(|count| antialiased(side, count));
-            for taps in &by_row {
-                for (columns, x) in by_column.iter().zip(&mut rows) {
-                    interpolate(&self.positions, side, [taps, columns], x);
-                }
-            }
-        }
-        self.patch_embedding
-            .apply(engine, patch_vectors, Epilogue::Add, x, scratch)
     }
 
     /// Writes the patches of an image, row by row, to the next of `vectors`.
@@ -212,5 +131,74 @@ impl Siglip {
                 }
             }
         }
+    }
+}
+
+impl VisionTower for Siglip {
+    fn embed(
+        &self,
+        kernels: &mut Kernels<'_>,
+        views: &[ViewPixels<'_>],
+        patch_vectors: &mut Scratch,
+        mut x: RowsMut<'_>,
+    ) -> Result<Option<Rope>> {
+        let side = self.config.table_side();
+        let mut patch_vectors = patch_vectors.rows(x.num_rows(), self.patch_embedding.in_features())?;
+        let (mut vectors, mut rows) = (patch_vectors.iter_mut(), x.iter_mut());
+        for view in views {
+            check_interrupted()?;
+            self.cut(view, &mut vectors);
+            let [by_row, by_column]: [Vec<Taps>; 2] = view.grid.map(|count| antialiased(side, count));
+            for taps in &by_row {
+                for (columns, x) in by_column.iter().zip(&mut rows) {
+                    interpolate(self.positions.rows(), side, [taps, columns], x);
+                }
+            }
+        }
+        drop((vectors, rows));
+        self.patch_embedding
+            .apply(kernels, patch_vectors.as_rows(), Epilogue::Add, x)?;
+        Ok(None)
+    }
+
+    fn blocks(&self) -> &[VisionBlock] {
+        &self.blocks
+    }
+
+    fn tokens<'a>(
+        &self,
+        kernels: &mut Kernels<'_>,
+        views: &[ViewPixels<'_>],
+        x: Rows<'a>,
+        workspace: &'a mut TokensWorkspace,
+    ) -> Result<(Rows<'a>, Vec<f32>)> {
+        let TokensWorkspace {
+            normed,
+            joined,
+            connector,
+        } = workspace;
+        let (width, patches_of_token) = (x.num_columns(), self.config.patches_of_token());
+        let y = normed.rows(x.num_rows(), width)?;
+        self.post_layernorm.apply(kernels.engine, x, y)?;
+        let y = normed.as_rows();
+        if self.config.merge == 1 {
+            return Ok((y, self.connector.tokens(kernels, y, connector)?));
+        }
+        let mut tokens = joined.rows(x.num_rows() / patches_of_token, patches_of_token * width)?;
+        let mut first = 0;
+        for view in views {
+            let patches = first..first + view.num_patches();
+            let own = first / patches_of_token..patches.end / patches_of_token;
+            first = patches.end;
+            let tokens = tokens.reborrow().rows(own);
+            pixel_shuffle(
+                self.config.merge,
+                self.patches,
+                view.grid,
+                y.rows(patches),
+                tokens,
+            );
+        }
+        Ok((y, self.connector.tokens(kernels, tokens.as_rows(), connector)?))
     }
 }

@@ -9,7 +9,7 @@ use half::{bf16, f16};
 use safetensors::Dtype;
 
 use crate::alloc::reserve;
-use crate::error::{Error, Result, problem, show_shape};
+use crate::error::{Error, Problem, Result, problem, show_shape};
 use crate::nn::weights::{Request, Source, Tensor};
 use crate::ops::check_interrupted;
 use saccade_vla_checkpoint::spec::{self, TensorProblem};
@@ -121,7 +121,7 @@ pub(crate) fn shape_of<'a>(tensors: &'a TensorViews<'_>, name: &str) -> Option<&
     tensors.get(name).map(|tensor| tensor.shape.as_slice())
 }
 
-/// All that is wrong with `tensors`: exactly the `expected` ones must be there, and those that `is_unused` knows may.
+/// All problems of `tensors`: exactly the `expected` ones must be there, and those that `is_unused` knows may.
 pub(crate) fn problems(
     tensors: &TensorViews<'_>,
     expected: &[TensorSpec],
@@ -133,6 +133,22 @@ pub(crate) fn problems(
     };
     let names = tensors.keys().map(String::as_str);
     spec::problems(names, describe, "", expected, is_unused)
+}
+
+/// Checks that there are none; `list` shows them.
+///
+/// # Errors
+/// [`Error::Shape`] if shapes alone are wrong, else [`Error::Checkpoint`].
+pub(crate) fn check(problems: &[TensorProblem], list: impl Fn(&[TensorProblem]) -> String) -> Result<()> {
+    if problems.is_empty() {
+        return Ok(());
+    }
+    let problem = Problem::new("tensors", list(problems));
+    let is_shape = |problem: &TensorProblem| matches!(problem, TensorProblem::Shape(_));
+    Err(match problems.iter().all(is_shape) {
+        true => Error::Shape(problem),
+        false => Error::Checkpoint(problem),
+    })
 }
 
 /// Tensors in memory as layers take them: each is copied when it is asked for, and the memory of the last copy is used again.

@@ -1,20 +1,23 @@
-//! A back end that notes what a model asks for: its tensors, and the order in which it reads them.
+//! A back end that notes the requests of a model: its tensors, and the order in which it reads them.
 
 use std::cell::RefCell;
 use std::collections::BTreeSet;
 
 use saccade_vla_checkpoint::{TensorSpec, Wanted};
+use saccade_vla_kernels::Isa;
 
+use crate::engine::Engine;
 use crate::error::Result;
-use crate::nn::weights::{Request, Source, Stored, Tensor};
+use crate::nn::weights::{Builder, Request, Source, Stored, Tensor, Weights};
+use crate::precision::Precision;
 
 /// Notes every request.
 #[derive(Default)]
-pub(crate) struct Planner {
+struct Planner {
     plan: RefCell<Plan>,
 }
 
-/// What a model asks for.
+/// The requests of a model.
 #[derive(Default)]
 pub(crate) struct Plan {
     /// Every tensor once, in the order in which it is first asked for.
@@ -24,10 +27,19 @@ pub(crate) struct Plan {
     names: BTreeSet<String>,
 }
 
-impl Planner {
-    pub(crate) fn into_plan(self) -> Plan {
-        self.plan.into_inner()
-    }
+/// The requests of the layers that `build` makes.
+///
+/// # Errors
+/// Those of `build`.
+pub(crate) fn plan<L>(build: impl FnOnce(&Weights<'_>) -> Result<L>) -> Result<Plan> {
+    let planner = Planner::default();
+    let engine = Engine {
+        isa: Isa::best(),
+        threads: 1,
+        precision: Precision::default(),
+    };
+    build(&Builder::new(&planner, engine).weights())?;
+    Ok(planner.plan.into_inner())
 }
 
 impl Source for Planner {

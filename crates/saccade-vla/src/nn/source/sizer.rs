@@ -5,20 +5,27 @@ use safetensors::Dtype;
 
 use crate::engine::Engine;
 use crate::error::Result;
-use crate::nn::weights::{Outline, Request, Source, Stored, Tensor};
+use crate::nn::weights::{Builder, Outline, Request, Source, Stored, Tensor, Weights};
 use crate::ops::packing_error;
 use crate::precision::Role;
 
 /// Measures layers made of tensors of the types that `dtype` gives by name.
-pub(crate) struct Sizer<D> {
+struct Sizer<D> {
     dtype: D,
     engine: Engine,
 }
 
-impl<D: Fn(&str) -> Result<Dtype>> Sizer<D> {
-    pub(crate) fn new(engine: Engine, dtype: D) -> Self {
-        Self { dtype, engine }
-    }
+/// Bytes of the layers that `build` makes, of tensors that are stored as `dtype` says by name.
+///
+/// # Errors
+/// Those of `build` and `dtype`.
+pub(crate) fn nbytes<L>(
+    engine: Engine,
+    dtype: impl Fn(&str) -> Result<Dtype>,
+    build: impl FnOnce(&Weights<'_>) -> Result<L>,
+) -> Result<usize> {
+    let (_, nbytes) = Builder::build(&Sizer { dtype, engine }, engine, build)?;
+    Ok(nbytes)
 }
 
 impl<D: Fn(&str) -> Result<Dtype>> Source for Sizer<D> {

@@ -2,7 +2,7 @@
 //!
 //! All weights are logarithms, and sums of them are taken relative to the largest (log-sum-exp), so that no finite bias over- or underflows.
 
-use saccade_vla_checkpoint::{granted, reserve};
+use saccade_vla_checkpoint::{probe_allocation, reserve};
 
 use crate::alloc::filled;
 use crate::error::{Error, Problem, Result, problem};
@@ -81,7 +81,7 @@ pub(super) fn resized(tokens: &[f32], width: usize, bias: &[f32], count: usize) 
         (0..count).map(|index| vec![index % before]).collect()
     } else {
         // As float64, while they are compared.
-        granted("future tokens", tokens.len().saturating_mul(size_of::<f64>()))?;
+        probe_allocation("future tokens", tokens.len().saturating_mul(size_of::<f64>()))?;
         merged(tokens, width, bias, count)?
     };
     let row = |index: usize| &tokens[index * width..(index + 1) * width];

@@ -1,0 +1,244 @@
+//! Flow matching: the velocity of noisy actions, and its integration from noise to actions, in the order in which it is
+//! computed.
+
+use std::sync::Arc;
+
+use saccade_vla_kernels::{Rows, RowsMut};
+
+use super::action_head::ActionHead;
+use super::dit::{ActiveRows, Pass};
+use super::workspace::Workspace;
+use crate::alloc::reserve;
+use crate::array::unravel;
+use crate::engine::Kernels;
+use crate::error::{Error, Result, problem, show_shape};
+use crate::inspect::trace::{Recorded, StepBlock};
+use crate::ops::check_interrupted;
+use crate::sampling::chunking::Seam;
+use crate::sampling::integrator::Integrator;
+use crate::sampling::timestep::timestep;
+
+/// The steps of an integration of the velocity.
+#[derive(Clone, Copy)]
+pub(super) struct Steps {
+    pub count: usize,
+    pub integrator: Integrator,
+    /// All rows run at the evaluations that this divides.
+    pub refresh: usize,
+}
+
+impl ActionHead {
+    /// The state rows of each observation, to `workspace.state`; of zeros for embodiments whose state does not act.
+    pub(super) fn encode_state(&self, state: &[f32], workspace: &mut Workspace) -> Result<()> {
+        let Workspace {
+            embodiment_ids,
+            zeroed_state,
+            state_hidden,
+            state: encoded,
+            linear,
+            ..
+        } = workspace;
+        let encoder = &self.layers.state_encoder;
+        let state = Rows::new(state, encoder.in_features());
+        let state = self.state_dropout.seen(embodiment_ids, state, zeroed_state)?;
+        let kernels = &mut Kernels::new(self.engine, linear);
+        encoder.apply(kernels, embodiment_ids, state, state_hidden, encoded)?;
+        Ok(())
+    }
+
+    /// The start of a chunk, to `workspace.x`: noise, and the end of the previous chunk if there is one. Elements that no
+    /// decoder moves are zero.
+    pub(super) fn begin(
+        &self,
+        noise: &[f32],
+        seam: Option<&Seam<'_>>,
+        samples: usize,
+        workspace: &mut Workspace,
+    ) -> Result<()> {
+        let Workspace { x, strength, .. } = workspace;
+        let (horizon, width) = (self.config.action_horizon, self.config.encoder_action_dim);
+        let noise = Rows::new(noise, width);
+        let mut x = x.rows(noise.num_rows(), width)?;
+        x.copy_from(noise);
+        strength.clear();
+        reserve("activations", strength, horizon)?;
+        strength.extend((0..horizon).map(|index| seam.map_or(1.0, |seam| seam.strength(index))));
+        if let Some(seam) = seam {
+            seam.begin(samples, horizon, x.reborrow());
+        }
+        x.columns(self.config.action_dim..width).fill(0.0);
+        Ok(())
+    }
+
+    /// Integrates the velocity from the noise in `workspace.x` to the actions in equal steps, in place.
+    pub(super) fn integrate(
+        &self,
+        pass: &Pass<'_>,
+        steps: Steps,
+        recorded: &mut Recorded<StepBlock>,
+        workspace: &mut Workspace,
+    ) -> Result<()> {
+        let dt = 1.0 / steps.count as f32;
+        let in_step = steps.integrator.evaluations();
+        let count = steps.count * in_step;
+        let refreshes = |evaluation: usize| evaluation.is_multiple_of(steps.refresh);
+        for evaluation in 0..count {
+            check_interrupted()?;
+            let step = evaluation / in_step;
+            let timestep = timestep(evaluation, count, self.config.num_timestep_buckets);
+            let rows = if !refreshes(evaluation) {
+                ActiveRows::Actions
+            } else if evaluation + 1 < count && !refreshes(evaluation + 1) {
+                ActiveRows::NeededAndHeld
+            } else {
+                pass.rows
+            };
+            self.evaluate(&Pass { step, rows, ..*pass }, |_| timestep, recorded, workspace)?;
+            let Workspace {
+                x,
+                start,
+                strength,
+                velocity,
+                ..
+            } = &mut *workspace;
+            let (v, x) = (velocity.as_rows(), x.as_rows_mut());
+            steps
+                .integrator
+                .advance(evaluation % in_step, dt, v, strength, x, start)?;
+        }
+        Ok(())
+    }
+
+    /// The velocity of the noisy actions in `workspace.x`, to `workspace.velocity`. `timestep` gives the timestep of an
+    /// observation.
+    pub(super) fn evaluate(
+        &self,
+        pass: &Pass<'_>,
+        timestep: impl Fn(usize) -> usize,
+        recorded: &mut Recorded<StepBlock>,
+        workspace: &mut Workspace,
+    ) -> Result<()> {
+        let times = &mut workspace.input.times;
+        times.clear();
+        reserve("activations", times, pass.context.batch)?;
+        let mut last = None;
+        for observation in 0..pass.context.batch {
+            let timestep = timestep(observation);
+            if last != Some(timestep) {
+                last = Some(timestep);
+                times.push(self.layers.dit.time(self.engine, timestep)?);
+            } else {
+                times.push(Arc::clone(&times[observation - 1]));
+            }
+        }
+        self.encode_actions(timestep, workspace)?;
+        self.assemble_rows(pass, workspace)?;
+        self.decode(pass, recorded, workspace)
+    }
+
+    /// Action rows, to `workspace.action`.
+    pub(super) fn encode_actions(
+        &self,
+        timestep: impl Fn(usize) -> usize,
+        workspace: &mut Workspace,
+    ) -> Result<()> {
+        let Workspace {
+            embodiment_ids,
+            x,
+            action_hidden,
+            action,
+            linear,
+            ..
+        } = workspace;
+        let kernels = &mut Kernels::new(self.engine, linear);
+        let encoder = &self.layers.action_encoder;
+        encoder.encode(
+            kernels,
+            embodiment_ids,
+            x.as_rows(),
+            timestep,
+            action_hidden,
+            action,
+        )
+    }
+
+    /// `[state, future, action]` for each sequence, or those of them that run, to the transformer's residual stream.
+    fn assemble_rows(&self, pass: &Pass<'_>, workspace: &mut Workspace) -> Result<()> {
+        let Workspace {
+            state, action, input, ..
+        } = workspace;
+        let (state, action, width) = (state.as_rows(), action.as_rows(), self.config.width);
+        if pass.rows == ActiveRows::Actions {
+            input.action.rows(action.num_rows(), width)?.copy_from(action);
+            return Ok(());
+        }
+        let groups = &pass.changes.extent.groups;
+        let future = Rows::new(pass.changes.extent.future_tokens, width);
+        let sequences = pass.context.batch * pass.samples;
+        let mut h = input.h.rows(sequences * groups.num_rows(), width)?;
+        for sequence in 0..sequences {
+            let observation = sequence / pass.samples;
+            let parts = [
+                state.rows(observation * groups.state..(observation + 1) * groups.state),
+                future,
+                action.rows(sequence * groups.action..(sequence + 1) * groups.action),
+            ];
+            let mut first = sequence * groups.num_rows();
+            for part in parts {
+                let rows = first..first + part.num_rows();
+                first = rows.end;
+                h.reborrow().rows(rows).copy_from(part);
+            }
+        }
+        Ok(())
+    }
+
+    /// The transformer, and the velocity that the decoders make of its output rows, to `workspace.velocity`.
+    fn decode(
+        &self,
+        pass: &Pass<'_>,
+        recorded: &mut Recorded<StepBlock>,
+        workspace: &mut Workspace,
+    ) -> Result<()> {
+        let Workspace {
+            embodiment_ids,
+            input,
+            dit,
+            decoder_hidden,
+            decoded,
+            velocity,
+            linear,
+            ..
+        } = workspace;
+        let kernels = &mut Kernels::new(self.engine, linear);
+        let output = self.layers.dit.forward(kernels, pass, input, recorded, dit)?;
+        let mut velocity = velocity.rows(output.num_rows(), self.config.action_dim)?;
+        let mut first = 0;
+        for decoder in &self.layers.decoders {
+            let decoded = decoder.apply(kernels, embodiment_ids, output, decoder_hidden, decoded)?;
+            let columns = first..first + decoded.num_columns();
+            first = columns.end;
+            velocity.reborrow().columns(columns).copy_from(decoded);
+        }
+        Ok(())
+    }
+
+    /// Copies the actions in `x`, without the elements that no decoder moves. `shape` is that of the noise.
+    ///
+    /// # Errors
+    /// [`Error::Input`] if one is not finite: a robot must not get it.
+    pub(super) fn copy_actions(&self, x: Rows<'_>, shape: &[usize], out: &mut [f32]) -> Result<()> {
+        let actions = x.columns(0..self.config.action_dim);
+        for (row, action) in actions.iter().enumerate() {
+            if let Some(column) = action.iter().position(|value| !value.is_finite()) {
+                return Err(Error::Input(problem!(
+                    "actions";
+                    "the result is not finite, {} at index {}: inputs or weights are too large for the arithmetic",
+                    action[column], show_shape(&unravel(row * x.num_columns() + column, shape))
+                )));
+            }
+        }
+        RowsMut::new(out, self.config.action_dim).copy_from(actions);
+        Ok(())
+    }
+}
