@@ -28,8 +28,8 @@ pub(crate) fn filled<T: Clone>(what: &'static str, len: usize, value: T) -> Resu
     Ok(buffer)
 }
 
-/// Elements written between two checks for interruption: the system hands out pages as they are first touched, some
-/// four gigabytes in a second.
+/// Elements written between two checks for interruption: the system hands out pages as they are first
+/// touched, some four gigabytes in a second.
 const TOGETHER: usize = 1 << 24;
 
 /// Calls `resize` with greater and greater lengths from `held` on, the last of which is `len`.
@@ -72,8 +72,8 @@ pub(crate) fn copied(what: &'static str, rows: Rows<'_>) -> Result<Vec<f32>> {
     Ok(buffer)
 }
 
-/// Memory for rows of one call, kept for later calls. The rows are there to be written: what they hold at first
-/// depends on earlier calls.
+/// Memory for rows of one call, kept for later calls. The rows are there to be written: what they hold at
+/// first depends on earlier calls.
 #[derive(Default)]
 pub(crate) struct Scratch {
     memory: Activations,
@@ -187,7 +187,7 @@ mod tests {
         assert_eq!(scratch.slice(len).unwrap().len(), len);
     }
 
-    /// Whether `work` gives up if it is to.
+    /// True if a cancelled `work` gives up.
     fn is_stopped(work: impl FnOnce() -> Result<()>) -> bool {
         let stopped = crate::interruptible(&|| true, || {
             std::thread::sleep(std::time::Duration::from_millis(30));

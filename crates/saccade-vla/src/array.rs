@@ -1,4 +1,5 @@
-//! Arrays with their shapes: borrowed, borrowed to be written, and owned. The checks that every argument passes.
+//! Arrays with their shapes: borrowed, borrowed to be written, and owned. The checks that every argument
+//! passes.
 
 use saccade_vla_kernels::Rows;
 
@@ -41,14 +42,14 @@ impl<'a, T> Array<'a, T> {
         self.shape
     }
 
-    /// That the array has exactly this shape; `axes` names its axes.
+    /// Checks that the array has exactly this shape; `axes` names its axes.
     pub(crate) fn check_shape(self, name: &str, axes: &str, expected: &[usize]) -> Result<Self> {
         check_shape(name, axes, self.shape, expected).map(|()| self)
     }
 }
 
 impl Array<'_, f32> {
-    /// That no element is NaN or infinite.
+    /// Checks that no element is NaN or infinite.
     pub(crate) fn check_finite(self, name: &str) -> Result<Self> {
         match first_not_finite(self.data) {
             None => Ok(self),
@@ -59,7 +60,7 @@ impl Array<'_, f32> {
         }
     }
 
-    /// That no element of a result is NaN or infinite.
+    /// Checks that no element of a result is NaN or infinite.
     pub(crate) fn check_result(self, name: &str) -> Result<Self> {
         match first_not_finite(self.data) {
             None => Ok(self),
@@ -114,7 +115,7 @@ impl<'a, T> ArrayMut<'a, T> {
         self.shape
     }
 
-    /// That the array has exactly this shape; `axes` names its axes. Hands over the elements.
+    /// Checks that the array has exactly this shape; `axes` names its axes. Hands over the elements.
     pub(crate) fn check_shape(self, name: &str, axes: &str, expected: &[usize]) -> Result<&'a mut [T]> {
         check_shape(name, axes, self.shape, expected).map(|()| self.data)
     }

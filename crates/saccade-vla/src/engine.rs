@@ -7,8 +7,8 @@ use saccade_vla_kernels::{Isa, LinearScratch};
 use crate::error::{Error, Result, problem};
 use crate::precision::Precision;
 
-/// The most threads that can be asked for: far more than any machine has cores, far fewer than make starting them a
-/// problem.
+/// The most threads that can be asked for: far more than any machine has cores, far fewer than make starting
+/// them a problem.
 const MAX_THREADS: usize = 1024;
 
 /// The instruction set, threads and precision that a model computes with.
@@ -27,7 +27,8 @@ impl Engine {
     /// The engine that the environment, `precision` and `num_threads` ask for.
     ///
     /// # Errors
-    /// [`Error::Input`] for a number of threads out of range, and for what the environment names but this machine lacks.
+    /// [`Error::Input`] for a number of threads out of range, and for what the environment names but this
+    /// machine lacks.
     pub(crate) fn new(precision: Precision, num_threads: Option<usize>) -> Result<Self> {
         let isa = Isa::from_env()?;
         let threads = match num_threads {
@@ -47,8 +48,8 @@ impl Engine {
     }
 }
 
-/// The engine that a layer runs on, and the scratch memory of linear layers: they run one after the other, so all of
-/// a call share it.
+/// The engine that a layer runs on, and the scratch memory of linear layers: they run one after the other, so
+/// all of a call share it.
 pub(crate) struct Kernels<'a> {
     pub engine: Engine,
     pub scratch: &'a mut LinearScratch,

@@ -7,9 +7,9 @@ use crate::profile::{Part, counted};
 
 /// Runs `work`, and asks `poll` every 20 ms or so whether to stop it.
 ///
-/// `poll` is called on this thread, between the tasks of every kernel that `work` calls, between blocks and between
-/// tensors. Once it returns true, `work` ends soon, however large it is. A head, a layer or a checkpoint that was in use
-/// stays usable.
+/// `poll` is called on this thread, between the tasks of every kernel that `work` calls, between blocks and
+/// between tensors. Once it returns true, `work` ends soon, however large it is. A head, a layer or a
+/// checkpoint that was in use stays usable.
 ///
 /// # Errors
 /// [`Error::Interrupted`] if `poll` returned true, otherwise those of `work`.

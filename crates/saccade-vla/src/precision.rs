@@ -1,4 +1,4 @@
-//! How precisely a head computes.
+//! Precisions, and the arithmetic of each kind of layer.
 
 use std::fmt;
 use std::str::FromStr;
@@ -21,21 +21,22 @@ pub(crate) enum Role {
 }
 
 impl Role {
-    /// Whether its weights are large: they may be stored as int8, and the memory that they are read into is used again.
+    /// True for large weights: they may be stored as int8, and the memory that they are read into is used
+    /// again.
     pub(crate) fn is_given_back(self) -> bool {
         matches!(self, Self::Block | Self::BackboneBlock)
     }
 
-    /// Whether in int8 elements of a row that are far larger than the others are multiplied in float32. Vision towers and language models
-    /// have such channels: in the residual stream, and most of all before the second layer of a feed-forward. The action head has none, and
-    /// keeps its bits.
+    /// True if in int8 the elements of a row that are far larger than the others are multiplied in float32.
+    /// Vision towers and language models have such channels: in the residual stream, and most of all before
+    /// the second layer of a feed-forward. The action head has none, and keeps its bits.
     pub(crate) fn keeps_outliers(self) -> bool {
         self == Self::BackboneBlock
     }
 }
 
-/// What weights are held in, and what the inputs of linear layers are rounded to. The residual stream, norms, softmax and all sums of
-/// floating-point products are float32 in each.
+/// The types of weights and of the inputs of linear layers. The residual stream, norms, softmax and all sums
+/// of floating-point products are float32 in each.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash)]
 #[non_exhaustive]
 pub enum Precision {
@@ -44,8 +45,8 @@ pub enum Precision {
     Float32,
     /// Weights, inputs of linear layers, keys and values in bf16.
     Bfloat16,
-    /// The linear layers of the blocks in int8: weights with one scale for each output, inputs with one for each row. The rest as in
-    /// [`Precision::Bfloat16`].
+    /// The linear layers of the blocks in int8: weights with one scale for each output, inputs with one for
+    /// each row. The rest as in [`Precision::Bfloat16`].
     Int8,
 }
 
@@ -61,18 +62,19 @@ impl Precision {
         }
     }
 
-    /// Whether weights that are stored as float32 are rounded to bf16.
+    /// True if weights that are stored as float32 are rounded to bf16.
     pub(crate) fn rounds_weights(self) -> bool {
         self != Self::Float32
     }
 
-    /// Whether tables whose rows are looked up are held as int8, with a scale for each row. That of N1.5 then takes 0.31 GB, not 0.62, and
-    /// its rows have a relative error of 0.8 %, where the features of int8 have one of 3 %.
+    /// True if tables whose rows are looked up are held as int8, with a scale for each row. That of N1.5 then
+    /// takes 0.31 GB, not 0.62, and its rows have a relative error of 0.8 %, where the features of int8 have
+    /// one of 3 %.
     pub(crate) fn quantizes_tables(self) -> bool {
         self == Self::Int8
     }
 
-    /// What keys and values are held in.
+    /// The type of KV caches.
     pub(crate) fn keys_values(self) -> Element {
         match self {
             Self::Float32 => Element::F32,

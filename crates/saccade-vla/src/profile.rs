@@ -1,4 +1,5 @@
-//! The time of a thread's calls, by part. Costs a branch around every kernel call unless that thread asked for it.
+//! The time of a thread's calls, by part. Costs a branch around every kernel call unless that thread asked
+//! for it.
 
 use std::cell::{Cell, RefCell};
 use std::marker::PhantomData;
@@ -48,7 +49,8 @@ parts! {
     FeedForwardOut = "feed_forward_out",
     /// Norms, with their scale and shift.
     Norm = "norm",
-    /// The layers with separate weights for each embodiment: encoders of state and actions, decoder of actions.
+    /// The layers with separate weights for each embodiment: encoders of state and actions, decoder of
+    /// actions.
     Embodiment = "embodiment",
     /// The projection after the last block.
     Output = "output",
@@ -106,8 +108,8 @@ impl Profile {
     }
 }
 
-/// The guard of [`Profile::start`]. It belongs to the thread that made it; where there are several, each counts all that is
-/// done while it is there.
+/// The guard of [`Profile::start`]. It belongs to the thread that made it; where there are several, each
+/// counts all that is done while it is there.
 #[derive(Debug)]
 #[must_use = "nothing is counted once it is dropped"]
 pub struct Profiling {

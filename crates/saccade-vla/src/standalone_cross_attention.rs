@@ -1,5 +1,5 @@
-//! The cross-attention of the head as a layer of its own, for programs in which everything else runs elsewhere. The
-//! head's blocks do not use it: they are in `head/dit.rs`, on the same [`Attention`].
+//! The cross-attention of the head as a layer of its own, for programs in which everything else runs
+//! elsewhere. The head's blocks do not use it: they are in `head/dit.rs`, on the same [`Attention`].
 
 use saccade_vla_kernels::{Epilogue, LinearScratch, PackedKeyValues, Rows, RowsMut};
 
@@ -77,12 +77,12 @@ impl<'a> KeyOptions<'a> {
 }
 
 impl CrossAttention {
-    /// From `to_q.weight (width, width)`, `to_k.weight` and `to_v.weight (width, context_dim)`, `to_out.0.weight (width, width)` and their
-    /// biases.
+    /// From `to_q.weight (width, width)`, `to_k.weight` and `to_v.weight (width, context_dim)`,
+    /// `to_out.0.weight (width, width)` and their biases.
     ///
     /// # Errors
-    /// [`Error::Checkpoint`] that lists every tensor that is missing, unknown or misshaped; [`Error::Input`] if `num_heads` does not divide
-    /// the width.
+    /// [`Error::Checkpoint`] that lists every tensor that is missing, unknown or misshaped; [`Error::Input`]
+    /// if `num_heads` does not divide the width.
     pub fn new(
         tensors: &TensorViews<'_>,
         num_heads: usize,
@@ -185,12 +185,13 @@ impl CrossAttention {
 
     /// Attends from `hidden_states (batch, queries, width)` to `kv`.
     ///
-    /// `key_mask (batch, num_vl_tokens)`: true = attended; `key_bias (batch, num_vl_tokens)` is added to the logits. A query with no key left
-    /// gets zeros before the output projection. `out` is `(batch, queries, width)`; `weights`, if wanted, `(batch, heads, queries, keys)`.
+    /// `key_mask (batch, num_vl_tokens)`: true = attended; `key_bias (batch, num_vl_tokens)` is added to the
+    /// logits. A query with no key left gets zeros before the output projection. `out` is
+    /// `(batch, queries, width)`; `weights`, if wanted, `(batch, heads, queries, keys)`.
     ///
     /// # Errors
-    /// [`Error::Shape`] and [`Error::Input`] for arguments that do not fit, [`Error::Input`] also for a result that is not finite, after which
-    /// `out` is zero; [`Error::Memory`].
+    /// [`Error::Shape`] and [`Error::Input`] for arguments that do not fit, [`Error::Input`] also for a
+    /// result that is not finite, after which `out` is zero; [`Error::Memory`].
     pub fn attend(
         &self,
         hidden_states: Array<'_>,

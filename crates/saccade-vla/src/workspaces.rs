@@ -7,8 +7,8 @@ use crate::error::{Error, Result};
 
 /// Workspaces that are not in use, at most as many as there were calls at the same time.
 ///
-/// The list is never waited for: a thread that finds its lock taken makes a workspace of its own, so that callers never stop each other, and a
-/// fork that copies a taken lock leaves the child slower, not stuck.
+/// The list is never waited for: a thread that finds its lock taken makes a workspace of its own, so that
+/// callers never stop each other, and a fork that copies a taken lock leaves the child slower, not stuck.
 pub(crate) struct Workspaces<W> {
     kept: Mutex<Vec<W>>,
     calls: AtomicUsize,
@@ -35,7 +35,8 @@ impl<W> Workspaces<W> {
         let mut workspace = kept.unwrap_or_else(new);
         let result = call(&mut workspace);
         drop(running);
-        // One that grew until memory ran out is not kept. Neither is one that was made only because the lock was taken.
+        // One that grew until memory ran out is not kept. Neither is one that was made only because the lock
+        // was taken.
         if !matches!(result, Err(Error::Memory { .. }))
             && let Ok(mut kept) = self.kept.try_lock()
             && kept.len() + self.calls.load(Ordering::Relaxed) < self.most_calls.load(Ordering::Relaxed)

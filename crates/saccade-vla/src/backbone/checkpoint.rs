@@ -1,4 +1,5 @@
-//! A backbone in a checkpoint, before it is loaded: what it is, which tensors it has, how much memory it will need.
+//! A backbone in a checkpoint, before it is loaded: what it is, which tensors it has, how much memory it will
+//! need.
 
 use std::path::Path;
 
@@ -21,12 +22,12 @@ pub struct BackboneCheckpoint {
 }
 
 impl BackboneCheckpoint {
-    /// Opens `source`, one `.safetensors` file or a directory of them, with `config`, as JSON, or the `config.json` next to the weights, if
-    /// there is one. Reads no tensor.
+    /// Opens `source`, one `.safetensors` file or a directory of them, with `config`, as JSON, or the
+    /// `config.json` next to the weights, if there is one. Reads no tensor.
     ///
     /// # Errors
-    /// [`Error::File`] for a path that is not there; [`Error::Checkpoint`] if there is no backbone, and for a config or tensors that are broken
-    /// or do not fit each other (all that does not fit is listed).
+    /// [`Error::File`] for a path that is not there; [`Error::Checkpoint`] if there is no backbone, and for a
+    /// config or tensors that are broken or do not fit each other (all that does not fit is listed).
     pub fn open(source: &Path, config: Option<&str>) -> Result<Self> {
         let checkpoint = Checkpoint::open(source)?;
         let given = match config {
@@ -54,7 +55,7 @@ impl BackboneCheckpoint {
         &self.found.config
     }
 
-    /// What the names of its tensors begin with.
+    /// The beginning of the names of its tensors.
     #[must_use]
     pub fn prefix(&self) -> &'static str {
         self.found.prefix

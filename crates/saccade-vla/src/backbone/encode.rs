@@ -1,4 +1,5 @@
-//! Encoding prompts: views through the tower, then the rows of all prompts together through the language model.
+//! Encoding prompts: views through the tower, then the rows of all prompts together through the language
+//! model.
 
 use std::sync::Arc;
 
@@ -18,11 +19,12 @@ use crate::nn::kv_cache;
 use crate::nn::rope::Rope;
 use crate::options::setters;
 
-/// Rows of the language model that are computed together. More read the weights less often; fewer keep the activations small: at 2048 rows
-/// the weights are read once for 7 prompts of one view, and the largest buffer is 50 MB at the released size.
+/// Rows of the language model that are computed together. More read the weights less often; fewer keep the
+/// activations small: at 2048 rows the weights are read once for 7 prompts of one view, and the largest
+/// buffer is 50 MB at the released size.
 const LANGUAGE_ROWS: usize = 2048;
 
-/// What to keep of a call for looking at.
+/// The parts of a call to record.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 #[non_exhaustive]
 pub struct BackboneKeep {
@@ -68,11 +70,12 @@ impl Sequence<'_> {
 }
 
 impl Backbone {
-    /// Encodes prompts. Each has the bits that it has alone: several inputs share the reading of the weights, and their prompts may be of
-    /// different lengths.
+    /// Encodes prompts. Each has the bits that it has alone: several inputs share the reading of the weights,
+    /// and their prompts may be of different lengths.
     ///
-    /// From `previous`, features that this backbone made, views with the same pixels are taken, and the rows, keys and values of tokens at the
-    /// beginning of a prompt that are the same. The result has the same bits without. Where something is recorded, all of it is computed.
+    /// From `previous`, features that this backbone made, views with the same pixels are taken, and the rows,
+    /// keys and values of tokens at the beginning of a prompt that are the same. The result has the same bits
+    /// without. Where something is recorded, all of it is computed.
     ///
     /// ```
     /// # use saccade_vla::{Array, Backbone, BackboneInputs, BackboneKeep, BackboneLoadOptions};
@@ -94,8 +97,8 @@ impl Backbone {
     /// ```
     ///
     /// # Errors
-    /// [`Error::Shape`] and [`Error::Input`] for inputs that do not fit, features of another backbone, and a result that is not finite;
-    /// [`Error::Memory`].
+    /// [`Error::Shape`] and [`Error::Input`] for inputs that do not fit, features of another backbone, and a
+    /// result that is not finite; [`Error::Memory`].
     pub fn encode(
         &self,
         inputs: &[BackboneInputs<'_>],
@@ -216,7 +219,7 @@ impl Backbone {
         Ok(sequences)
     }
 
-    /// What is returned for inputs, with room for what is recorded.
+    /// Empty features for inputs, with memory for what is recorded.
     fn empty(&self, inputs: &Checked<'_>, keep: BackboneKeep) -> Result<BackboneFeatures> {
         let mut recorded = BackboneRecord::default();
         if keep.hidden {
@@ -303,8 +306,8 @@ impl Backbone {
             .collect()
     }
 
-    /// Writes the tokens of words and views to the rows of `x`; returns the rows that are added to them after the first
-    /// layers.
+    /// Writes the tokens of words and views to the rows of `x`; returns the rows that are added to them after
+    /// the first layers.
     fn embed<'a>(&self, group: &'a [Sequence<'_>], mut x: RowsMut<'_>) -> Result<Vec<Additions<'a>>> {
         let width = x.num_columns();
         let mut deepstack: Vec<Additions<'a>> = vec![Vec::new(); self.config.vision.deepstack.len()];

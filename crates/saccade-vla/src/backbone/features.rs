@@ -18,10 +18,11 @@ pub struct BackboneFeatures {
     pub(super) recorded: BackboneRecord,
 }
 
-/// What was recorded of a call.
+/// Recorded parts of a call.
 #[derive(Default)]
 pub struct BackboneRecord {
-    /// The rows after each layer of the language model, before anything is added to them: `(batch, tokens, width)`, by layer.
+    /// The rows after each layer of the language model, before anything is added to them:
+    /// `(batch, tokens, width)`, by layer.
     pub hidden: Vec<OwnedArray>,
     /// The patches of each view after the vision tower, `(patches, vision width)`, by prompt and view.
     pub vision: Vec<Vec<OwnedArray>>,
@@ -52,7 +53,7 @@ pub(super) struct View {
     pub tokens: Vec<f32>,
     /// The same, to be added after the first layers of the language model.
     pub deepstack: Vec<Vec<f32>>,
-    /// What is recorded of it; otherwise empty.
+    /// The patches after the vision tower where they are recorded, else empty.
     pub patches: Vec<f32>,
 }
 
@@ -130,8 +131,8 @@ impl BackboneFeatures {
         std::mem::take(&mut self.recorded)
     }
 
-    /// Bytes held, without what was recorded: features, pixels and tokens of views, keys and values. What several features share is counted
-    /// in each of them.
+    /// Bytes held, without what was recorded: features, pixels and tokens of views, keys and values. What
+    /// several features share is counted in each of them.
     #[must_use]
     pub fn nbytes(&self) -> usize {
         self.prompts.iter().map(|prompt| prompt.nbytes()).sum()

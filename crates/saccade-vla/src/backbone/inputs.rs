@@ -8,12 +8,13 @@ use crate::array::{Array, unravel};
 use crate::error::{Error, Result, problem, show_shape};
 use crate::options::setters;
 
-/// The inputs of [`Backbone::encode`](super::model::Backbone::encode), as the released processors prepare them.
+/// The inputs of [`Backbone::encode`](super::model::Backbone::encode), as the released processors prepare
+/// them.
 #[derive(Clone, Debug)]
 #[non_exhaustive]
 pub struct BackboneInputs<'a> {
-    /// The normalised pixels of all views, those of the first prompt first: arrays `(views, 3, height, width)`, whose sizes may differ, or for
-    /// N1.7 one of patches, `(patches, values)`.
+    /// The normalised pixels of all views, those of the first prompt first: arrays
+    /// `(views, 3, height, width)`, whose sizes may differ, or for N1.7 one of patches, `(patches, values)`.
     pub pixel_values: Vec<Array<'a>>,
     /// The tokens of the prompts, `(batch, tokens)`.
     pub input_ids: Array<'a, i64>,

@@ -16,7 +16,7 @@ pub(super) struct BackboneLayers {
     pub embedding: Embedding,
     pub vision: Vision,
     pub language: Qwen3,
-    /// What changes the width of the features, if anything does.
+    /// The last layer, if the features have a width of their own.
     pub projection: Option<Linear>,
 }
 

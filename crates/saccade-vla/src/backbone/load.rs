@@ -17,7 +17,7 @@ use crate::nn::weights::{Builder, Source};
 use crate::options::setters;
 use crate::precision::Precision;
 
-/// How a backbone is loaded.
+/// Options of loading a backbone.
 ///
 /// ```
 /// use saccade_vla::{BackboneLoadOptions, Precision};
@@ -29,9 +29,10 @@ use crate::precision::Precision;
 pub struct BackboneLoadOptions {
     /// The config as JSON; default the `config.json` in the checkpoint's directory, if it is there.
     pub config: Option<String>,
-    /// What is computed in what.
+    /// The arithmetic of each kind of layer.
     pub precision: Precision,
-    /// Threads that a call uses; default `SACCADE_NUM_THREADS`, or the physical cores that the process may use.
+    /// Threads that a call uses; default `SACCADE_NUM_THREADS`, or the physical cores that the process may
+    /// use.
     pub num_threads: Option<usize>,
 }
 
@@ -47,9 +48,11 @@ impl BackboneLoadOptions {
 }
 
 impl Backbone {
-    /// Loads a backbone from `source`: one `.safetensors` file, or a directory of one or more of them with a `config.json`.
+    /// Loads a backbone from `source`: one `.safetensors` file, or a directory of one or more of them with a
+    /// `config.json`.
     ///
-    /// The version is that of the tensors. Sizes that the config does not hold are those of the published model.
+    /// The version is that of the tensors. Sizes that the config does not hold are those of the published
+    /// model.
     ///
     /// ```
     /// use saccade_vla::{Backbone, BackboneLoadOptions};
@@ -59,8 +62,9 @@ impl Backbone {
     /// ```
     ///
     /// # Errors
-    /// [`Error::File`] for a path that is not there; [`Error::Checkpoint`] for a config or weights that are broken, not finite or do not
-    /// fit each other (all that does not fit is listed); [`Error::Input`] for options out of range; [`Error::Memory`].
+    /// [`Error::File`] for a path that is not there; [`Error::Checkpoint`] for a config or weights that are
+    /// broken, not finite or do not fit each other (all that does not fit is listed); [`Error::Input`] for
+    /// options out of range; [`Error::Memory`].
     pub fn load(source: &Path, options: &BackboneLoadOptions) -> Result<Self> {
         let engine = Engine::new(options.precision, options.num_threads)?;
         let published = BackboneCheckpoint::open(source, options.config.as_deref())?;
@@ -75,13 +79,14 @@ impl Backbone {
         })
     }
 
-    /// A backbone from `tensors` in memory, by their names in a checkpoint, with the config in `options`, or that of the published model: bit for
-    /// bit the backbone that [`Self::load`] reads from a file of them. The tensors are borrowed for the call only.
+    /// A backbone from `tensors` in memory, by their names in a checkpoint, with the config in `options`, or
+    /// that of the published model: bit for bit the backbone that [`Self::load`] reads from a file of them.
+    /// The tensors are borrowed for the call only.
     ///
     /// # Errors
-    /// [`Error::Checkpoint`] for a broken config, for tensors that are missing or unknown, and for weights that are not finite;
-    /// [`Error::Shape`] if shapes alone are wrong (all that is wrong is listed in both); [`Error::Input`] for options out of range;
-    /// [`Error::Memory`].
+    /// [`Error::Checkpoint`] for a broken config, for tensors that are missing or unknown, and for weights
+    /// that are not finite; [`Error::Shape`] if shapes alone are wrong (all that is wrong is listed in both);
+    /// [`Error::Input`] for options out of range; [`Error::Memory`].
     pub fn from_tensors(tensors: &TensorViews<'_>, options: &BackboneLoadOptions) -> Result<Self> {
         let engine = Engine::new(options.precision, options.num_threads)?;
         let given = GivenConfig::parse(options.config.as_deref().unwrap_or("{}"))?;

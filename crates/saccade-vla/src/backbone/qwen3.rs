@@ -44,7 +44,8 @@ pub(super) struct NewRows<'a> {
     pub caches: &'a mut [PackedKeyValues],
 }
 
-/// Rows that are added to the hidden state after a layer, each with the number of the row that it is added to.
+/// Rows that are added to the hidden state after a layer, each with the number of the row that it is added
+/// to.
 pub(super) type Additions<'a> = Vec<(usize, &'a [f32])>;
 
 /// Memory kept between calls.
@@ -96,8 +97,8 @@ impl Qwen3 {
         })
     }
 
-    /// Runs the layers over the rows of all prompts, which are in `workspace.x`. `deepstack` is added after the first
-    /// layers; `record` is given the rows after each layer, before that.
+    /// Runs the layers over the rows of all prompts, which are in `workspace.x`. `deepstack` is added after
+    /// the first layers; `record` is given the rows after each layer, before that.
     pub(super) fn run(
         &self,
         kernels: &mut Kernels<'_>,

@@ -1,11 +1,13 @@
-//! What a call may take from features of earlier calls: views of the same pixels, and prompts that begin in the same way.
+//! What a call may take from features of earlier calls: views of the same pixels, and prompts that begin in
+//! the same way.
 
 use std::sync::Arc;
 
 use super::features::{BackboneFeatures, EncodedPrompt, View};
 use super::inputs::{Prompt, ViewPixels};
 
-/// A view of `previous` with the same pixels: the one at the same place of the same prompt if that has them, or else any.
+/// A view of `previous` with the same pixels: the one at the same place of the same prompt if that has them,
+/// or else any.
 pub(super) fn same_view(
     previous: &[&BackboneFeatures],
     (prompt, place): (usize, usize),
@@ -25,7 +27,8 @@ fn same_bytes(a: &[f32], b: &[f32]) -> bool {
     bytemuck::cast_slice::<f32, u8>(a) == bytemuck::cast_slice::<f32, u8>(b)
 }
 
-/// The prompt of `previous` with which `prompt`, whose views are `views`, has the longest beginning in common, and how long that is.
+/// The prompt of `previous` with which `prompt`, whose views are `views`, has the longest beginning in
+/// common, and how long that is.
 pub(super) fn longest_prefix<'a>(
     previous: &[&'a BackboneFeatures],
     prompt: &Prompt<'_>,

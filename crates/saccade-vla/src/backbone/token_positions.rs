@@ -6,8 +6,8 @@ use crate::alloc::{collected, filled};
 use crate::error::{Error, Result, problem};
 use crate::nn::rope::{RopePair, one_axis};
 
-/// The rotation of the pairs of the language model's heads: all by the place in the prompt, or interleaved by time,
-/// height and width.
+/// The rotation of the pairs of the language model's heads: all by the place in the prompt, or interleaved by
+/// time, height and width.
 pub(super) fn rope_pairs(config: &BackboneConfig) -> Vec<RopePair> {
     let language = &config.language;
     let mut pairs = one_axis(language.rope_theta, language.head_dim);
@@ -25,8 +25,8 @@ pub(super) fn rope_pairs(config: &BackboneConfig) -> Vec<RopePair> {
 
 /// The position of each token of a prompt: time, height and width.
 ///
-/// Without `mrope_section` it is the place in the prompt, padding counted. With it padding does not count, and a view counts as many steps
-/// as its longer side has tokens.
+/// Without `mrope_section` it is the place in the prompt, padding counted. With it padding does not count,
+/// and a view counts as many steps as its longer side has tokens.
 pub(super) fn token_positions(
     config: &BackboneConfig,
     prompt: &Prompt<'_>,

@@ -1,4 +1,5 @@
-//! Action rows from noisy actions and the timestep: `W3 silu(W2 [W1 x; tau]) + position` with the first two layers merged.
+//! Action rows from noisy actions and the timestep: `W3 silu(W2 [W1 x; tau]) + position` with the first two
+//! layers merged.
 
 use std::sync::Arc;
 
@@ -24,11 +25,11 @@ use crate::sampling::timestep_embedding::action_encoder_embedding;
 /// Time biases that are cached, one for each embodiment and timestep; 1.6 MB at N1.5's size.
 pub(super) const CACHED_TIME_BIASES: usize = 256;
 
-/// `W3(silu(W2([W1(x); tau]))) + position`, as the released layers compute, for the sinusoidal embedding `tau` of the
-/// timestep.
+/// `W3(silu(W2([W1(x); tau]))) + position`, as the released layers compute, for the sinusoidal embedding
+/// `tau` of the timestep.
 ///
-/// The action half of `W2([W1(x); tau])` is linear in `x` and becomes one small layer. The time half, with everything
-/// constant added to it, depends on embodiment and timestep only: the time bias.
+/// The action half of `W2([W1(x); tau])` is linear in `x` and becomes one small layer. The time half, with
+/// everything constant added to it, depends on embodiment and timestep only: the time bias.
 pub(crate) struct ActionEncoder {
     /// `W1 W2[0:width]`, without bias: `(encoder_action_dim -> width)`.
     action: EmbodimentLinear,
@@ -71,8 +72,8 @@ impl ActionEncoder {
     }
 
     /// Action rows, `(batch * samples * action_horizon, width)`, to `encoded`, for noisy actions
-    /// `x (batch * samples * action_horizon, encoder_action_dim)` of observations of these embodiments. `timestep` gives
-    /// the timestep of an observation.
+    /// `x (batch * samples * action_horizon, encoder_action_dim)` of observations of these embodiments.
+    /// `timestep` gives the timestep of an observation.
     pub(crate) fn encode(
         &self,
         kernels: &mut Kernels<'_>,

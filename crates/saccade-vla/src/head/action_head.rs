@@ -11,9 +11,9 @@ use crate::workspaces::Workspaces;
 
 /// A loaded action head. Immutable; serves any number of threads at once.
 ///
-/// A checkpoint of GR00T-H may hold `dropout_prob_by_embodiment`, how often its training set the state of each embodiment to zero. The states
-/// of embodiments for which it always did so (above 0.999) are set to zero here too, as the released class does; the other entries act in
-/// training only.
+/// A checkpoint of GR00T-H may hold `dropout_prob_by_embodiment`, how often its training set the state of
+/// each embodiment to zero. The states of embodiments for which it always did so (above 0.999) are set to
+/// zero here too, as the released class does; the other entries act in training only.
 pub struct ActionHead {
     pub(super) config: HeadConfig,
     pub(super) engine: Engine,
@@ -60,7 +60,8 @@ impl ActionHead {
         &self.embodiment_ids
     }
 
-    /// The learned future tokens, `(num_future_tokens, width)`: what the future rows are before the first block.
+    /// The learned future tokens, `(num_future_tokens, width)`: what the future rows are before the first
+    /// block.
     #[must_use]
     pub fn future_tokens(&self) -> Array<'_> {
         self.layers.future_tokens.view()

@@ -21,8 +21,9 @@ impl<K: Eq, V> Cache<K, V> {
 
     /// The value of `key`, computed if it is not there. A computation that fails leaves nothing.
     ///
-    /// The lock is never waited for, nor held while computing: a thread that finds it taken computes for itself. So callers never stop
-    /// each other, and a fork that copies a taken lock leaves the child slower, not stuck.
+    /// The lock is never waited for, nor held while computing: a thread that finds it taken computes for
+    /// itself. So callers never stop each other, and a fork that copies a taken lock leaves the child slower,
+    /// not stuck.
     pub(crate) fn get_or_insert(&self, key: K, compute: impl FnOnce() -> Result<V>) -> Result<Arc<V>> {
         if let Ok(mut entries) = self.entries.try_lock()
             && let Some(position) = entries.iter().position(|(known, _)| *known == key)

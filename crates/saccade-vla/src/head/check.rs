@@ -1,4 +1,4 @@
-//! Whether the arguments of a call fit the head and each other.
+//! Checks of the arguments of a call: that they fit the head and each other.
 
 use super::action_head::ActionHead;
 use super::context::Context;

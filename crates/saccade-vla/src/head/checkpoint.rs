@@ -1,4 +1,5 @@
-//! A checkpoint of a head that is not loaded: the check of its tensors, and the bytes of weights that the head would hold.
+//! A checkpoint of a head that is not loaded: the check of its tensors, and the bytes of weights that the
+//! head would hold.
 
 use saccade_vla_checkpoint::spec;
 
@@ -12,8 +13,8 @@ use crate::precision::Precision;
 use crate::recognise::HeadCheckpoint;
 
 impl HeadCheckpoint {
-    /// Checks that exactly the head's tensors are under the prefix, each of the right shape and a readable type. Tensors that only training
-    /// uses may be there too.
+    /// Checks that exactly the head's tensors are under the prefix, each of the right shape and a readable
+    /// type. Tensors that only training uses may be there too.
     ///
     /// # Errors
     /// [`Error::Checkpoint`] that lists every tensor that is missing, unknown, misshaped or of another type.
@@ -28,7 +29,7 @@ impl HeadCheckpoint {
         Err(Error::Checkpoint(Problem::new("source", listed)))
     }
 
-    /// Whether the head has a tensor `name`, without the prefix.
+    /// True if the head has a tensor `name`, without the prefix.
     pub(super) fn has(&self, name: &str) -> bool {
         self.checkpoint.shape(&format!("{}{name}", self.prefix)).is_some()
     }
@@ -36,8 +37,8 @@ impl HeadCheckpoint {
     /// [`ActionHead::nbytes`](crate::ActionHead::nbytes) of a head with this number of embodiments.
     ///
     /// # Errors
-    /// [`Error::Isa`] for an unknown instruction set in the environment; [`Error::Checkpoint`] and [`Error::Packing`] for
-    /// a tensor that is not there or has too many inputs for int8.
+    /// [`Error::Isa`] for an unknown instruction set in the environment; [`Error::Checkpoint`] and
+    /// [`Error::Packing`] for a tensor that is not there or has too many inputs for int8.
     pub fn nbytes(&self, precision: Precision, num_embodiments: usize) -> Result<usize> {
         let engine = Engine::new(precision, Some(1))?;
         let dtype = |name: &str| Ok(self.checkpoint.dtype(&format!("{}{name}", self.prefix))?);

@@ -37,7 +37,8 @@ impl Context {
         self.num_vl_tokens
     }
 
-    /// The tokens after `vlln` and the VL self-attention, `(batch, num_vl_tokens, context_dim)`; rows of removed positions are zero.
+    /// The tokens after `vlln` and the VL self-attention, `(batch, num_vl_tokens, context_dim)`; rows of
+    /// removed positions are zero.
     #[must_use]
     pub fn vl_embs(&self) -> &[f32] {
         &self.vl_embs
@@ -91,8 +92,8 @@ impl Seen {
         }
     }
 
-    /// The rows that are seen of these observations, whose tokens are `vl`, one observation after the other; `gathered` is
-    /// memory for them.
+    /// The rows that are seen of these observations, whose tokens are `vl`, one observation after the other;
+    /// `gathered` is memory for them.
     pub(crate) fn rows<'a>(
         &self,
         observations: Range<usize>,

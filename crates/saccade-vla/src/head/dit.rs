@@ -28,7 +28,8 @@ use crate::sampling::timestep_embedding::{TIME_CHANNELS, transformer_embedding};
 const BLOCK_EPS: f32 = 1e-5;
 const OUTPUT_EPS: f32 = 1e-6;
 
-/// Timesteps whose modulations are cached: the 4 of the released sampler several times over; 13 MB at N1.5's size.
+/// Timesteps whose modulations are cached: the 4 of the released sampler several times over; 13 MB at N1.5's
+/// size.
 const CACHED_TIMESTEPS: usize = 64;
 
 pub(crate) struct Dit {
@@ -85,7 +86,8 @@ pub(crate) enum ActiveRows {
     Needed,
     /// As [`Self::Needed`], and the KV caches of the self-attention blocks are held.
     NeededAndHeld,
-    /// The action rows. The self-attention blocks read the keys and values of the other rows from the held KV caches.
+    /// The action rows. The self-attention blocks read the keys and values of the other rows from the held KV
+    /// caches.
     Actions,
 }
 
@@ -116,7 +118,7 @@ impl BlockCall<'_> {
 pub(crate) struct DitInput {
     /// The residual stream, `(sequences * rows, width)`, unless only the action rows run.
     pub h: Scratch,
-    /// That of the action rows alone, `(sequences * action_rows, width)`, where only they run.
+    /// The action rows alone, `(sequences * action_rows, width)`, where only they run.
     pub action: Scratch,
     /// By observation.
     pub times: Vec<Arc<TimeModulations>>,
@@ -233,8 +235,8 @@ impl Dit {
         })
     }
 
-    /// Runs all blocks over `input.h`, or over `input.action` where only these rows run: the output rows of the actions,
-    /// `(sequences * action_rows, hidden_dim)`.
+    /// Runs all blocks over `input.h`, or over `input.action` where only these rows run: the output rows of
+    /// the actions, `(sequences * action_rows, hidden_dim)`.
     pub(crate) fn forward<'a>(
         &self,
         kernels: &mut Kernels<'_>,
@@ -295,7 +297,8 @@ impl Dit {
         Ok(output.as_rows())
     }
 
-    /// `x += attention(adaptive_norm(x))`. Keys and values come from the rows `all` where `x` is only some of them.
+    /// `x += attention(adaptive_norm(x))`. Keys and values come from the rows `all` where `x` is only some of
+    /// them.
     fn attend(
         &self,
         kernels: &mut Kernels<'_>,

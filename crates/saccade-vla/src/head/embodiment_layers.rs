@@ -1,5 +1,5 @@
-//! Layers with separate weights for each embodiment (`CategorySpecificLinear` and `CategorySpecificMLP` of the released
-//! code).
+//! Layers with separate weights for each embodiment (`CategorySpecificLinear` and `CategorySpecificMLP` of
+//! the released code).
 
 use saccade_vla_kernels::{Epilogue, Rows, RowsMut};
 
@@ -13,7 +13,8 @@ use crate::nn::weights::Weights;
 use crate::precision::Role;
 use crate::profile::Part;
 
-/// One linear layer per embodiment: `y = x W[embodiment_id] + b[embodiment_id]`. Only the slices in use are in memory.
+/// One linear layer per embodiment: `y = x W[embodiment_id] + b[embodiment_id]`. Only the slices in use are
+/// in memory.
 pub(crate) struct EmbodimentLinear {
     /// By embodiment id; `None` where it was not loaded.
     layers: Vec<Option<Linear>>,
@@ -50,7 +51,8 @@ impl EmbodimentLinear {
         Ok(Self { layers })
     }
 
-    /// `out = epilogue(x W + b)`, with the rows of each observation, equally many, in the layer of its embodiment.
+    /// `out = epilogue(x W + b)`, with the rows of each observation, equally many, in the layer of its
+    /// embodiment.
     pub(crate) fn apply(
         &self,
         kernels: &mut Kernels<'_>,

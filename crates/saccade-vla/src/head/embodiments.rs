@@ -7,7 +7,7 @@ use crate::error::{Error, Problem, Result, problem};
 pub(crate) struct Embodiments<'a> {
     /// The ids in use, ascending.
     pub ids: &'a [usize],
-    /// How many there are.
+    /// Their number in the checkpoint.
     pub count: usize,
 }
 

@@ -20,14 +20,15 @@ use crate::options::setters;
 pub struct Features<'a> {
     /// `(batch, num_vl_tokens, context_dim)`.
     pub backbone_features: Array<'a>,
-    /// `(batch, num_vl_tokens)`, true = attended; none if all are. A head that ignores padding takes an all-true mask only.
+    /// `(batch, num_vl_tokens)`, true = attended; none if all are. A head that ignores padding takes an
+    /// all-true mask only.
     pub attention_mask: Option<Array<'a, bool>>,
-    /// `(batch, num_vl_tokens)`, true = image token. A head whose blocks alternate between text and images needs it; every head keeps it, for
-    /// maps.
+    /// `(batch, num_vl_tokens)`, true = image token. A head whose blocks alternate between text and images
+    /// needs it; every head keeps it, for maps.
     pub image_mask: Option<Array<'a, bool>>,
     /// `(batch, num_vl_tokens)`, true = as if the position were not there.
     pub drop_vl: Option<Array<'a, bool>>,
-    /// What to keep of the VL self-attention.
+    /// The parts of the VL self-attention to record.
     pub record: Keep,
 }
 
@@ -59,7 +60,7 @@ impl<'a> Features<'a> {
         self.image_mask.is_some_and(|mask| mask.data()[token])
     }
 
-    /// Whether a position is attended and not dropped.
+    /// True for a position that is attended and not dropped.
     fn is_left(&self, token: usize) -> bool {
         self.attention_mask.is_none_or(|mask| mask.data()[token])
             && !self.drop_vl.is_some_and(|mask| mask.data()[token])
@@ -67,7 +68,8 @@ impl<'a> Features<'a> {
 }
 
 impl ActionHead {
-    /// Encodes observations: `vlln`, the VL self-attention, and the keys and values of every cross-attention block.
+    /// Encodes observations: `vlln`, the VL self-attention, and the keys and values of every cross-attention
+    /// block.
     ///
     /// ```
     /// # use saccade_vla::{ActionHead, Array, Features, LoadOptions};
@@ -83,8 +85,8 @@ impl ActionHead {
     /// ```
     ///
     /// # Errors
-    /// [`Error::Shape`] and [`Error::Input`] for features or masks that do not fit, [`Error::Input`] also for a result that is not finite;
-    /// [`Error::Memory`].
+    /// [`Error::Shape`] and [`Error::Input`] for features or masks that do not fit, [`Error::Input`] also for
+    /// a result that is not finite; [`Error::Memory`].
     pub fn encode(&self, features: &Features<'_>) -> Result<Context> {
         let (batch, num_vl_tokens) = self.check_features(features)?;
         let removed = match features.drop_vl.filter(|mask| mask.data().contains(&true)) {
@@ -182,10 +184,11 @@ impl ActionHead {
         Ok((batch, num_vl_tokens))
     }
 
-    /// What each kind of the head's blocks sees of the features.
+    /// The tokens that each kind of the head's blocks sees.
     ///
     /// # Errors
-    /// [`Error::Input`] if a kind that alternates with another sees nothing of an observation: its softmax is not defined.
+    /// [`Error::Input`] if a kind that alternates with another sees nothing of an observation: its softmax is
+    /// not defined.
     fn seen(&self, features: &Features<'_>, batch: usize, num_vl_tokens: usize) -> Result<Vec<Seen>> {
         let all_are_left = (0..batch * num_vl_tokens).all(|token| features.is_left(token));
         let mut seen = Vec::new();

@@ -1,5 +1,5 @@
-//! Flow matching: the velocity of noisy actions, and its integration from noise to actions, in the order in which it is
-//! computed.
+//! Flow matching: the velocity of noisy actions, and its integration from noise to actions, in the order in
+//! which it is computed.
 
 use std::sync::Arc;
 
@@ -28,7 +28,8 @@ pub(super) struct Steps {
 }
 
 impl ActionHead {
-    /// The state rows of each observation, to `workspace.state`; of zeros for embodiments whose state does not act.
+    /// The state rows of each observation, to `workspace.state`; of zeros for embodiments whose state does
+    /// not act.
     pub(super) fn encode_state(&self, state: &[f32], workspace: &mut Workspace) -> Result<()> {
         let Workspace {
             embodiment_ids,
@@ -46,8 +47,8 @@ impl ActionHead {
         Ok(())
     }
 
-    /// The start of a chunk, to `workspace.x`: noise, and the end of the previous chunk if there is one. Elements that no
-    /// decoder moves are zero.
+    /// The start of a chunk, to `workspace.x`: noise, and the end of the previous chunk if there is one.
+    /// Elements that no decoder moves are zero.
     pub(super) fn begin(
         &self,
         noise: &[f32],
@@ -109,8 +110,8 @@ impl ActionHead {
         Ok(())
     }
 
-    /// The velocity of the noisy actions in `workspace.x`, to `workspace.velocity`. `timestep` gives the timestep of an
-    /// observation.
+    /// The velocity of the noisy actions in `workspace.x`, to `workspace.velocity`. `timestep` gives the
+    /// timestep of an observation.
     pub(super) fn evaluate(
         &self,
         pass: &Pass<'_>,
@@ -162,7 +163,8 @@ impl ActionHead {
         )
     }
 
-    /// `[state, future, action]` for each sequence, or those of them that run, to the transformer's residual stream.
+    /// `[state, future, action]` for each sequence, or those of them that run, to the transformer's residual
+    /// stream.
     fn assemble_rows(&self, pass: &Pass<'_>, workspace: &mut Workspace) -> Result<()> {
         let Workspace {
             state, action, input, ..

@@ -20,7 +20,7 @@ use crate::options::setters;
 use crate::precision::Precision;
 use crate::recognise::HeadCheckpoint;
 
-/// How a head is loaded.
+/// Options of loading a head.
 ///
 /// ```
 /// use saccade_vla::{LoadOptions, Precision};
@@ -34,13 +34,16 @@ pub struct LoadOptions {
     pub config: Option<String>,
     /// Keep only these embodiments; default all.
     pub embodiment_ids: Option<Vec<i64>>,
-    /// Actions in a chunk, in place of the config's `action_horizon`; at most as many as the position table has rows.
+    /// Actions in a chunk, in place of the config's `action_horizon`; at most as many as the position table
+    /// has rows.
     pub action_horizon: Option<usize>,
-    /// States in an observation, each with a state row of its own; default 1. N1.7 makes one row of as many states as its config says.
+    /// States in an observation, each with a state row of its own; default 1. N1.7 makes one row of as many
+    /// states as its config says.
     pub num_states: Option<usize>,
-    /// What is computed in what.
+    /// The arithmetic of each kind of layer.
     pub precision: Precision,
-    /// Threads that a call uses; default `SACCADE_NUM_THREADS`, or the physical cores that the process may use.
+    /// Threads that a call uses; default `SACCADE_NUM_THREADS`, or the physical cores that the process may
+    /// use.
     pub num_threads: Option<usize>,
 }
 
@@ -73,7 +76,8 @@ impl LoadOptions {
 }
 
 impl ActionHead {
-    /// Loads a head from `source`: one `.safetensors` file, or a directory of one or more of them with a `config.json`.
+    /// Loads a head from `source`: one `.safetensors` file, or a directory of one or more of them with a
+    /// `config.json`.
     ///
     /// ```
     /// use saccade_vla::{ActionHead, LoadOptions, Precision};
@@ -84,8 +88,9 @@ impl ActionHead {
     /// ```
     ///
     /// # Errors
-    /// [`Error::File`] for a path that is not there; [`Error::Checkpoint`] for a config or weights that are broken, not finite or do not
-    /// fit each other (all that does not fit is listed); [`Error::Input`] for options out of range; [`Error::Memory`].
+    /// [`Error::File`] for a path that is not there; [`Error::Checkpoint`] for a config or weights that are
+    /// broken, not finite or do not fit each other (all that does not fit is listed); [`Error::Input`] for
+    /// options out of range; [`Error::Memory`].
     pub fn load(source: &Path, options: &LoadOptions) -> Result<Self> {
         let engine = Engine::new(options.precision, options.num_threads)?;
         let mut published = HeadCheckpoint::open(source, options.config.as_deref())?;
@@ -113,14 +118,15 @@ impl ActionHead {
         })
     }
 
-    /// A head from `tensors` in memory, by their names in a checkpoint without a prefix, with the sizes of the config in `options`, which must
-    /// be there: bit for bit the head that [`Self::load`] reads from a file of them. The tensors are borrowed for the call only, and of
-    /// layers for each embodiment only the wanted slices are touched.
+    /// A head from `tensors` in memory, by their names in a checkpoint without a prefix, with the sizes of
+    /// the config in `options`, which must be there: bit for bit the head that [`Self::load`] reads from a
+    /// file of them. The tensors are borrowed for the call only, and of layers for each embodiment only the
+    /// wanted slices are touched.
     ///
     /// # Errors
-    /// [`Error::Checkpoint`] for a broken config, for tensors that are missing or unknown, and for weights that are not finite;
-    /// [`Error::Shape`] if shapes alone are wrong (all that is wrong is listed in both); [`Error::Input`] for options out of range;
-    /// [`Error::Memory`].
+    /// [`Error::Checkpoint`] for a broken config, for tensors that are missing or unknown, and for weights
+    /// that are not finite; [`Error::Shape`] if shapes alone are wrong (all that is wrong is listed in both);
+    /// [`Error::Input`] for options out of range; [`Error::Memory`].
     pub fn from_tensors(tensors: &TensorViews<'_>, options: &LoadOptions) -> Result<Self> {
         let engine = Engine::new(options.precision, options.num_threads)?;
         let given_config = options.config.as_deref().ok_or_else(|| {

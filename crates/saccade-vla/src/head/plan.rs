@@ -12,7 +12,8 @@ use crate::nn::source::planner::{Plan, plan};
 /// Name, without a prefix, and shape of every tensor that a head's checkpoint must hold.
 ///
 /// # Errors
-/// [`Error::Interrupted`](crate::Error::Interrupted) if the call was stopped by [`interruptible`](crate::interruptible).
+/// [`Error::Interrupted`](crate::Error::Interrupted) if the call was stopped by
+/// [`interruptible`](crate::interruptible).
 pub fn tensor_shapes(config: &HeadConfig) -> Result<Vec<(String, Vec<usize>)>> {
     let tensors = tensor_specs(config)?.into_iter();
     Ok(tensors
@@ -22,7 +23,8 @@ pub fn tensor_shapes(config: &HeadConfig) -> Result<Vec<(String, Vec<usize>)>> {
         .collect())
 }
 
-/// The tensors that must fit a head of this config where `has` finds them: those that it needs, and what it reads if it is there.
+/// The tensors that must fit a head of this config where `has` finds them: those that it needs, and what it
+/// reads if it is there.
 ///
 /// # Errors
 /// As [`tensor_shapes`].
@@ -43,7 +45,7 @@ pub(crate) fn tensor_specs(config: &HeadConfig) -> Result<Vec<TensorSpec>> {
     Ok(planned(config, &[0])?.specs)
 }
 
-/// What a head with these embodiments reads, in the order in which it is built.
+/// The tensors that a head with these embodiments reads, in the order in which it is built.
 ///
 /// # Errors
 /// As [`tensor_shapes`].
@@ -56,8 +58,9 @@ fn planned(config: &HeadConfig, ids: &[usize]) -> Result<Plan> {
     plan(|weights| HeadLayers::new(weights, config, Embodiments { ids, count }))
 }
 
-/// Whether a head of this config may come with a tensor `name`, without a prefix, of this shape, that only its training uses: the forks'
-/// logarithms of loss weights, and what N1.6 puts in place of a state that it hides.
+/// True if a head of this config may come with a tensor `name`, without a prefix, of this shape, that only
+/// its training uses: the forks' logarithms of loss weights, and what N1.6 puts in place of a state that it
+/// hides.
 pub(crate) fn is_unused(config: &HeadConfig, name: &str, shape: &[usize]) -> bool {
     match name {
         "mask_token" => shape == [1, 1, config.width],

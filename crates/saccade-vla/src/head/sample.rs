@@ -13,7 +13,7 @@ use crate::options::setters;
 use crate::sampling::chunking::Chunking;
 use crate::sampling::integrator::Integrator;
 
-/// How a chunk is sampled.
+/// Options of sampling.
 ///
 /// ```
 /// use saccade_vla::{Integrator, Sampling};
@@ -29,13 +29,14 @@ pub struct Sampling<'a> {
     pub integrator: Integrator,
     /// Chunks for each observation; none adds no axis to noise and result.
     pub num_samples: Option<usize>,
-    /// The rows of state and future tokens run at every `future_refresh`-th evaluation of the velocity, beginning with the first. At the
-    /// others only the action rows run, and self-attention uses the keys and values that the other rows last had. `None` and 1 run all rows
-    /// at every evaluation, which is exact.
+    /// The rows of state and future tokens run at every `future_refresh`-th evaluation of the velocity,
+    /// beginning with the first. At the others only the action rows run, and self-attention uses the keys and
+    /// values that the other rows last had. `None` and 1 run all rows at every evaluation, which is exact.
     pub future_refresh: Option<usize>,
     /// The previous chunk, and how this one begins with its end; none starts from noise alone.
     pub chunking: Option<Chunking<'a>>,
-    /// What to change inside the head. Cuts and biases act on the rows that run; a patch of rows that do not is an error.
+    /// Changes inside the head. Cuts and biases act on the rows that run; a patch of rows that do not is an
+    /// error.
     pub interventions: &'a [Intervention],
 }
 
@@ -57,11 +58,13 @@ impl<'a> Sampling<'a> {
 }
 
 impl ActionHead {
-    /// Samples a chunk of actions by flow matching: integrates the velocity from `noise` in `num_steps` steps.
+    /// Samples a chunk of actions by flow matching: integrates the velocity from `noise` in `num_steps`
+    /// steps.
     ///
-    /// `state` is `(batch, num_states, state_dim)`, or `(batch, state_dim)` where one is taken; `embodiment_id` a scalar or `(batch,)`;
-    /// `noise` `(batch, action_horizon, encoder_action_dim)`, or `(batch, num_samples, action_horizon, encoder_action_dim)` with
-    /// `num_samples`. `out` has the shape of the noise, with `action_dim` for its last axis.
+    /// `state` is `(batch, num_states, state_dim)`, or `(batch, state_dim)` where one is taken;
+    /// `embodiment_id` a scalar or `(batch,)`; `noise` `(batch, action_horizon, encoder_action_dim)`, or
+    /// `(batch, num_samples, action_horizon, encoder_action_dim)` with `num_samples`. `out` has the shape of
+    /// the noise, with `action_dim` for its last axis.
     ///
     /// ```
     /// # use saccade_vla::{ActionHead, Array, ArrayMut, Features, LoadOptions, Sampling};
@@ -83,8 +86,8 @@ impl ActionHead {
     /// ```
     ///
     /// # Errors
-    /// [`Error::Shape`] and [`Error::Input`] for arguments that do not fit, [`Error::Input`] also for actions that are not finite;
-    /// [`Error::Memory`]. `out` is then untouched.
+    /// [`Error::Shape`] and [`Error::Input`] for arguments that do not fit, [`Error::Input`] also for actions
+    /// that are not finite; [`Error::Memory`]. `out` is then untouched.
     pub fn sample(
         &self,
         context: &Context,

@@ -1,7 +1,7 @@
 //! Embodiments whose state does not act.
 //!
-//! The class of GR00T-H keeps how often its training sets the state of each embodiment to zero in a tensor, and at inference sets those to
-//! zero that it always did so for.
+//! The class of GR00T-H keeps how often its training sets the state of each embodiment to zero in a tensor,
+//! and at inference sets those to zero that it always did so for.
 
 use saccade_vla_kernels::Rows;
 use serde_json::Value;
@@ -27,10 +27,11 @@ pub(crate) struct StateDropout {
     drops: Vec<bool>,
 }
 
-/// Whether a head with this config reads the tensor of probabilities; `is_there` tells whether there is one.
+/// True if a head with this config reads the tensor of probabilities; `is_there` says if there is one.
 ///
 /// # Errors
-/// [`Error::Checkpoint`] if the config says that states are set to zero and there is no tensor that says which.
+/// [`Error::Checkpoint`] if the config says that states are set to zero and there is no tensor that says
+/// which.
 pub(super) fn reads_state_dropout(config: &str, is_there: bool) -> Result<bool> {
     let config = CheckpointConfig::parse(config)?;
     let Some(given) = config.get(CONFIG_KEY) else {
@@ -73,8 +74,8 @@ impl StateDropout {
         Ok(Self { drops })
     }
 
-    /// The rows of states, equally many for each of the `embodiment_ids`, as the state encoder sees them: in `zeroed` if
-    /// some are set to zero.
+    /// The rows of states, equally many for each of the `embodiment_ids`, as the state encoder sees them: in
+    /// `zeroed` if some are set to zero.
     pub(super) fn seen<'a>(
         &self,
         embodiment_ids: &[usize],

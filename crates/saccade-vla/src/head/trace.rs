@@ -14,10 +14,11 @@ use crate::inspect::trace::{Recorded, Shapes, StepBlock, Trace, TraceOptions};
 use crate::sampling::integrator::Integrator;
 
 impl ActionHead {
-    /// As [`Self::sample`], and keeps what goes on inside. All rows are computed in every block, the last included.
+    /// As [`Self::sample`], and keeps what goes on inside. All rows are computed in every block, the last
+    /// included.
     ///
-    /// There is one chunk for each observation, and all rows run at every step: `sampling.num_samples` and `sampling.future_refresh` must
-    /// be none, and `sampling.integrator` Euler's.
+    /// There is one chunk for each observation, and all rows run at every step: `sampling.num_samples` and
+    /// `sampling.future_refresh` must be none, and `sampling.integrator` Euler's.
     ///
     /// ```
     /// # use saccade_vla::{ActionHead, Array, Features, Keep, LoadOptions, Sampling, TraceOptions};
@@ -33,8 +34,8 @@ impl ActionHead {
     /// ```
     ///
     /// # Errors
-    /// [`Error::Shape`] and [`Error::Input`] for arguments that do not fit, for a trace of more than `options.max_bytes`, and for actions that
-    /// are not finite; [`Error::Memory`].
+    /// [`Error::Shape`] and [`Error::Input`] for arguments that do not fit, for a trace of more than
+    /// `options.max_bytes`, and for actions that are not finite; [`Error::Memory`].
     pub fn trace(
         &self,
         context: &Context,
@@ -101,7 +102,7 @@ impl ActionHead {
     }
 }
 
-/// That a call of these options is one that a trace can be made of.
+/// Checks that a trace can be made of a call with these options.
 fn check_traceable(sampling: &Sampling<'_>) -> Result<()> {
     if let Some(samples) = sampling.num_samples {
         return Err(Error::Input(problem!(

@@ -21,12 +21,13 @@ pub struct NoisyActions<'a> {
 }
 
 impl ActionHead {
-    /// The velocity of noisy actions, to `out (batch, action_horizon, action_dim)`. `state` and `embodiment_id` are as for
-    /// [`Self::sample`]. To the interventions it is step 0 of 1.
+    /// The velocity of noisy actions, to `out (batch, action_horizon, action_dim)`. `state` and
+    /// `embodiment_id` are as for [`Self::sample`]. To the interventions it is step 0 of 1.
     ///
     /// # Errors
-    /// [`Error::Shape`](crate::Error::Shape) and [`Error::Input`](crate::Error::Input) for arguments that do not fit and a velocity that is
-    /// not finite; [`Error::Memory`](crate::Error::Memory). `out` is then untouched.
+    /// [`Error::Shape`](crate::Error::Shape) and [`Error::Input`](crate::Error::Input) for arguments that do
+    /// not fit and a velocity that is not finite; [`Error::Memory`](crate::Error::Memory). `out` is then
+    /// untouched.
     pub fn velocity(
         &self,
         context: &Context,

@@ -1,4 +1,5 @@
-//! The vision-language tokens: `vlln`, the VL self-attention, and the KV caches of the cross-attention blocks.
+//! The vision-language tokens: `vlln`, the VL self-attention, and the KV caches of the cross-attention
+//! blocks.
 
 use std::ops::Range;
 
@@ -19,14 +20,15 @@ use crate::ops::check_interrupted;
 use crate::precision::Role;
 use crate::profile::Part;
 
-/// Rows of vision-language tokens that are encoded together. More rows read the weights less often; fewer keep the
-/// intermediate activations small. At 1024 rows the weights are read once per 3 to 4 camera views and the largest buffer
-/// is 32 MB at N1.5's size.
+/// Rows of vision-language tokens that are encoded together. More rows read the weights less often; fewer
+/// keep the intermediate activations small. At 1024 rows the weights are read once per 3 to 4 camera views
+/// and the largest buffer is 32 MB at N1.5's size.
 const ENCODE_ROWS: usize = 1024;
 
 const EPS: f32 = 1e-5;
 
-/// As much as a trace holds by default: the probabilities of N1.5's four blocks over three cameras for six observations.
+/// As much as a trace holds by default: the probabilities of N1.5's four blocks over three cameras for six
+/// observations.
 const MAX_RECORDED_BYTES: u64 = 1 << 31;
 
 /// `vlln` and the blocks of the VL self-attention.
@@ -51,7 +53,8 @@ pub(crate) struct VlTokens<'a> {
     pub features: Rows<'a>,
     pub batch: usize,
     pub num_vl_tokens: usize,
-    /// Biases of the logits of each token in the VL self-attention, `(batch, num_vl_tokens)`: minus infinity removes it.
+    /// Biases of the logits of each token in the VL self-attention, `(batch, num_vl_tokens)`: minus infinity
+    /// removes it.
     pub removed: Option<&'a [f32]>,
     /// The tokens that each kind of cross-attention block sees.
     pub seen: &'a [Seen],
@@ -59,7 +62,8 @@ pub(crate) struct VlTokens<'a> {
     pub cross: &'a [Option<(Reads, &'a Attention)>],
 }
 
-/// The tokens as the cross-attention blocks see them, `(batch, num_vl_tokens, context_dim)`, and by block their KV caches.
+/// The tokens as the cross-attention blocks see them, `(batch, num_vl_tokens, context_dim)`, and by block
+/// their KV caches.
 pub(crate) type Encoded = (Vec<f32>, Vec<Vec<PackedKeyValues>>);
 
 /// Memory kept between calls.
@@ -123,7 +127,8 @@ impl VlEncoder {
         Recorded::allocate("record", record, &blocks, MAX_RECORDED_BYTES)
     }
 
-    /// The tokens that the cross-attention blocks see, and their KV caches. Records what `recorded` has room for.
+    /// The tokens that the cross-attention blocks see, and their KV caches. Records what `recorded` has room
+    /// for.
     pub(crate) fn encode(
         &self,
         kernels: &mut Kernels<'_>,

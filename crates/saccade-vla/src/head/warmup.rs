@@ -9,7 +9,8 @@ use crate::config::Reads;
 use crate::error::{Error, Problem, Result, problem};
 use crate::sampling::timestep::timestep;
 
-/// Elements of tokens and rows that a warm-up may ask for: 8 GB in float32, far above any batch that a CPU is given.
+/// Elements of tokens and rows that a warm-up may ask for: 8 GB in float32, far above any batch that a CPU is
+/// given.
 const MAX_WARMUP_ELEMENTS: usize = 1 << 31;
 
 impl ActionHead {
@@ -80,7 +81,7 @@ impl ActionHead {
         )
     }
 
-    /// That the rows of such a call are not more than any call is given.
+    /// Checks that the rows of such a call are not more than any call is given.
     fn check_warmup(&self, num_vl_tokens: usize, batch: usize, num_samples: usize) -> Result<()> {
         let config = &self.config;
         let rows = num_samples

@@ -1,4 +1,5 @@
-//! Multi-head attention with its projections: what the blocks of the head and the stand-alone cross-attention share.
+//! Multi-head attention with its projections: what the blocks of the head and the stand-alone cross-attention
+//! share.
 
 use saccade_vla_kernels::{Epilogue, LogitBias, PackedKeyValues, Rows, RowsMut};
 
@@ -34,15 +35,15 @@ pub(crate) struct AttentionWorkspace {
     packed: Vec<PackedKeyValues>,
 }
 
-/// What cross-attention attends to.
+/// The keys and values of a cross-attention.
 pub(crate) struct CrossKeys<'a> {
     /// The KV cache of each group of sequences.
     pub caches: &'a [PackedKeyValues],
     /// The keys that each group has, where these are not all.
     pub subset: Option<Subset<'a>>,
     pub bias: Bias<'a>,
-    /// Receives the softmax, `(sequences, heads, queries, keys)`; takes one sequence in each group. Of a subset, it
-    /// is over all keys, and zero before.
+    /// Receives the softmax, `(sequences, heads, queries, keys)`; takes one sequence in each group. Of a
+    /// subset, it is over all keys, and zero before.
     pub probabilities: Option<&'a mut [f32]>,
 }
 
@@ -51,11 +52,11 @@ pub(crate) struct CrossKeys<'a> {
 pub(crate) struct Subset<'a> {
     /// By group, ascending.
     pub positions: &'a [Vec<usize>],
-    /// How many there are to choose from: biases that are shared, and probabilities, are over all of them.
+    /// The number that they are chosen from: shared biases and probabilities are over all of them.
     pub all: usize,
 }
 
-/// What self-attention attends to.
+/// The keys and values of a self-attention.
 pub(crate) struct SelfKeys<'a> {
     /// The rows that keys and values are made of.
     pub source: Sequences<'a>,
@@ -84,8 +85,8 @@ pub(crate) struct Bias<'a> {
 }
 
 impl Bias<'_> {
-    /// The bias of `[heads, queries, keys]` logits of one group, whose keys are those at `positions` of the shared
-    /// bias, if only some are there. `memory` is for one that has to be computed.
+    /// The bias of `[heads, queries, keys]` logits of one group, whose keys are those at `positions` of the
+    /// shared bias, if only some are there. `memory` is for one that has to be computed.
     fn of<'s>(
         &'s self,
         group: usize,
@@ -125,8 +126,8 @@ impl Bias<'_> {
 }
 
 impl Attention {
-    /// From `to_q`, `to_k`, `to_v` and `to_out.0`, as diffusers names them. Keys and values come from rows of `context_dim`; their work is
-    /// counted under `kv_part`.
+    /// From `to_q`, `to_k`, `to_v` and `to_out.0`, as diffusers names them. Keys and values come from rows of
+    /// `context_dim`; their work is counted under `kv_part`.
     pub(crate) fn new(
         weights: &Weights<'_>,
         width: usize,
@@ -192,8 +193,8 @@ impl Attention {
         ))
     }
 
-    /// `out = epilogue(to_out(softmax(to_q(y) keys^T / sqrt(head_dim)) values))`. As many sequences of `y` as there
-    /// are for each KV cache attend to the same one.
+    /// `out = epilogue(to_out(softmax(to_q(y) keys^T / sqrt(head_dim)) values))`. As many sequences of `y` as
+    /// there are for each KV cache attend to the same one.
     pub(crate) fn cross(
         &self,
         kernels: &mut Kernels<'_>,
@@ -211,8 +212,8 @@ impl Attention {
         } = keys;
         self.queries(kernels, y, workspace)?;
         let (q, mut mixed) = (workspace.q.as_rows(), workspace.mixed.as_rows_mut());
-        // A shared bias is one sequence's, so each sequence is then a call of its own; otherwise those that read the
-        // same keys share one.
+        // A shared bias is one sequence's, so each sequence is then a call of its own; otherwise those that
+        // read the same keys share one.
         let of_group = y.count / caches.len();
         let together = if bias.shared.is_some() { 1 } else { of_group };
         for first in (0..y.count).step_by(together) {

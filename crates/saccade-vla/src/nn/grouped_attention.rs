@@ -1,5 +1,5 @@
-//! Self-attention of language and vision models: heads of queries that share heads of keys, norms of both, rotary
-//! positions, a causal mask.
+//! Self-attention of language and vision models: heads of queries that share heads of keys, norms of both,
+//! rotary positions, a causal mask.
 
 use std::ops::Range;
 
@@ -53,15 +53,16 @@ pub(crate) enum Attended<'a, 'b> {
 
 /// A sequence whose KV cache outlives the call.
 pub(crate) struct Causal<'a> {
-    /// Holds keys and values of earlier rows; those of the given rows are appended, if they may be attended to.
+    /// Holds keys and values of earlier rows; those of the given rows are appended, if they may be attended
+    /// to.
     pub cache: &'a mut PackedKeyValues,
-    /// For each of the given rows whether rows may attend to it. A row that finds nothing to attend to gets zeros
-    /// from the attention.
+    /// For each of the given rows whether rows may attend to it. A row that finds nothing to attend to gets
+    /// zeros from the attention.
     pub attended: &'a [bool],
 }
 
-/// `o_proj(softmax(q k^T / sqrt(head_dim)) v)` with `q = rope(norm(q_proj y))`, `k = rope(norm(k_proj y))` and
-/// `v = v_proj y`.
+/// `o_proj(softmax(q k^T / sqrt(head_dim)) v)` with `q = rope(norm(q_proj y))`, `k = rope(norm(k_proj y))`
+/// and `v = v_proj y`.
 pub(crate) struct GroupedAttention {
     qkv: Linear,
     out: Linear,
@@ -200,8 +201,8 @@ impl Attend<'_> {
         self.attend(rows, packed, Mask::None)
     }
 
-    /// A causal sequence, whose rows begin with number `first`: run by run of rows that may be attended to, or may
-    /// not.
+    /// A causal sequence, whose rows begin with number `first`: run by run of rows that may be attended to,
+    /// or may not.
     fn causal(&mut self, first: usize, Causal { cache, attended }: &mut Causal<'_>) -> Result<()> {
         let mut start = first;
         for run in attended.chunk_by(|a, b| a == b) {

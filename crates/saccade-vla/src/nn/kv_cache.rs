@@ -1,5 +1,5 @@
-//! KV caches: packed keys and values, in the element type that an engine's precision asks for, and the attention
-//! to them.
+//! KV caches: packed keys and values, in the element type that an engine's precision asks for, and the
+//! attention to them.
 
 use saccade_vla_kernels::{Mask, PackedKeyValues, Rows, RowsMut};
 

@@ -41,7 +41,8 @@ impl Linear {
         Self::of_shapes(&parts, role, has_bias)
     }
 
-    /// A convolution whose windows do not overlap, `weight (out_features, ...)` and a bias: each window is a row.
+    /// A convolution whose windows do not overlap, `weight (out_features, ...)` and a bias: each window is a
+    /// row.
     pub(crate) fn windows(weights: &Weights<'_>, shape: &[usize], role: Role) -> Result<Self> {
         Self::of_shapes(&[(weights, shape.to_vec())], role, true)
     }

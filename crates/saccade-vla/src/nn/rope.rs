@@ -36,9 +36,9 @@ pub(crate) struct Rope {
 }
 
 impl Rope {
-    /// The angles of the first `pairs` of heads of `head_dim`, whose other elements stay as they are, for rows at
-    /// `positions`. Angles are float32 as in released code; their cosines and sines are evaluated in float64 and
-    /// rounded once.
+    /// The angles of the first `pairs` of heads of `head_dim`, whose other elements stay as they are, for
+    /// rows at `positions`. Angles are float32 as in released code; their cosines and sines are evaluated in
+    /// float64 and rounded once.
     pub(crate) fn new<const AXES: usize>(
         head_dim: usize,
         pairs: &[RopePair],

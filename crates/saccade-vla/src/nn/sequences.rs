@@ -29,8 +29,8 @@ impl<'a> Sequences<'a> {
         sequences.start * self.len..sequences.end * self.len
     }
 
-    /// The rows of each run of neighbouring sequences with the same one of `keys`, one for each sequence; `is_same` says
-    /// which are.
+    /// The rows of each run of neighbouring sequences with the same one of `keys`, one for each sequence;
+    /// `is_same` says which are.
     pub(crate) fn runs<'k, K>(
         &self,
         keys: &'k [K],

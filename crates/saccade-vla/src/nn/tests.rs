@@ -1,4 +1,5 @@
-//! Layers against plain loops in float64, and those of released models against the code that they were released with.
+//! Layers against plain loops in float64, and those of released models against the code that they were
+//! released with.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -156,7 +157,8 @@ fn linear_layers_without_a_bias() {
     }
 }
 
-/// Checks that `add(engine, layer, y, x)` gives `expected` for `y` and `x (rows, width)`, on each instruction set.
+/// Checks that `add(engine, layer, y, x)` gives `expected` for `y` and `x (rows, width)`, on each instruction
+/// set.
 fn assert_adds<L>(
     layers: Vec<(Engine, L)>,
     (y, x, width): (&[f32], &[f32], usize),

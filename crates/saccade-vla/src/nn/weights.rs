@@ -1,5 +1,6 @@
-//! What layers are built from. A model is described once, by the code that builds its layers from [`Weights`]; what comes of that depends on
-//! the [`Source`]: the list of its tensors (planner), its size in memory (sizer), or its layers (a file, or tensors in memory).
+//! What layers are built from. A model is described once, by the code that builds its layers from
+//! [`Weights`]; what comes of that depends on the [`Source`]: the list of its tensors (planner), its size in
+//! memory (sizer), or its layers (a file, or tensors in memory).
 
 use std::cell::Cell;
 use std::ops::Range;
@@ -20,13 +21,15 @@ pub(crate) struct Request {
     pub spec: TensorSpec,
     /// Slices of the first axis; none asks for the whole tensor.
     pub slices: Option<Range<usize>>,
-    /// Whether its memory comes back to be read into again: only what is not kept may be read into larger memory than it needs.
+    /// True if its memory comes back to be read into again: only a tensor that is not kept may be read into
+    /// larger memory than it needs.
     pub is_given_back: bool,
 }
 
 /// One of the back ends that a model's description is run against.
 pub(crate) trait Source {
-    /// The tensor, or its outline where nothing but names and sizes is wanted. One without elements need not be there.
+    /// The tensor, or its outline where nothing but names and sizes is wanted. One without elements need not
+    /// be there.
     ///
     /// # Errors
     /// As the source has them: a tensor that is missing or cannot be read.
@@ -50,7 +53,7 @@ pub(crate) enum Tensor {
     Outline(Stored),
 }
 
-/// What a weight is packed from.
+/// The type that a weight is packed from.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub(crate) enum Stored {
     F32,
@@ -93,7 +96,8 @@ impl Tensor {
         }
     }
 
-    /// As `(out_features, in_features)` of a tensor stored as `(in_features, out_features)`, as the category-specific layers are.
+    /// As `(out_features, in_features)` of a tensor stored as `(in_features, out_features)`, as the
+    /// category-specific layers are.
     pub(crate) fn transposed(&self, out_features: usize, in_features: usize) -> Weight<'_> {
         let Self::Held(elements) = self else {
             return self.weight(out_features, in_features);
@@ -174,7 +178,7 @@ pub(crate) fn weight_view(elements: &Elements, out_features: usize, in_features:
     weight
 }
 
-/// What all layers of one model are built with.
+/// Builds all layers of one model.
 pub(crate) struct Builder<'a> {
     source: &'a dyn Source,
     engine: Engine,
@@ -240,7 +244,8 @@ impl Weights<'_> {
         self.builder.engine
     }
 
-    /// The weight of a layer of this role, `(out_features, in_features)` or with several axes in place of the last one.
+    /// The weight of a layer of this role, `(out_features, in_features)` or with several axes in place of the
+    /// last one.
     pub(crate) fn weight(&self, role: Role, shape: &[usize]) -> Result<Tensor> {
         let weight = self.read(Request {
             spec: TensorSpec {
@@ -282,8 +287,8 @@ impl Weights<'_> {
         OwnedArray::new(table, &[rows, shape[1]])
     }
 
-    /// The table `weight`, whose rows are looked up: as int8 with a scale for each row if that is what is computed in, in bf16 if that is
-    /// how it is stored or what is computed in, else in float32.
+    /// The table `weight`, whose rows are looked up: as int8 with a scale for each row if that is what is
+    /// computed in, in bf16 if that is how it is stored or what is computed in, else in float32.
     pub(crate) fn looked_up(&self, shape: [usize; 2]) -> Result<Tensor> {
         let table = self.read(Request {
             spec: TensorSpec::plain(&self.name("weight"), &shape),
@@ -318,7 +323,8 @@ impl Weights<'_> {
         })
     }
 
-    /// Packs weights with their biases as one layer: their outputs are concatenated. Biases of outlines are not looked at.
+    /// Packs weights with their biases as one layer: their outputs are concatenated. Biases of outlines are
+    /// not looked at.
     pub(crate) fn pack(&self, role: Role, parts: &[(Weight<'_>, Option<&[f32]>)]) -> Result<PackedLinear> {
         let engine = self.engine();
         let arithmetic = engine.precision.arithmetic(role);
@@ -393,7 +399,8 @@ fn quantized(table: &Elements, [num_rows, width]: [usize; 2]) -> Result<Tensor> 
     Ok(Tensor::Held(Elements::Int8 { values, scales }))
 }
 
-/// That weights are finite. One that is not spoils every action, without a sign of where it comes from.
+/// Checks that weights are finite. One that is not spoils every action, without a sign of where it comes
+/// from.
 fn check_finite(request: &Request, elements: &Elements) -> Result<()> {
     let (position, value) = match elements {
         Elements::F32(values) => match first_not_finite(values) {

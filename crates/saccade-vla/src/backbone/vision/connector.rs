@@ -1,5 +1,5 @@
-//! The connector between vision tower and language model: squares of patches are joined, normed, and projected to the
-//! width of the language model.
+//! The connector between vision tower and language model: squares of patches are joined, normed, and
+//! projected to the width of the language model.
 
 use saccade_vla_kernels::{Epilogue, Rows, RowsMut};
 
@@ -69,8 +69,8 @@ impl Connector {
         })
     }
 
-    /// The tokens `(tokens, output)` of rows of the width of the norm, several of which make a token if that is the
-    /// width of a patch.
+    /// The tokens `(tokens, output)` of rows of the width of the norm, several of which make a token if that
+    /// is the width of a patch.
     pub(super) fn tokens(
         &self,
         kernels: &mut Kernels<'_>,
@@ -104,8 +104,8 @@ impl Connector {
     }
 }
 
-/// Pixel shuffle: joins the squares of `merge` patches on each side of a view `x (rows * columns, width)`, row by row,
-/// to `out (rows * columns / merge^2, merge^2 * width)`.
+/// Pixel shuffle: joins the squares of `merge` patches on each side of a view `x (rows * columns, width)`,
+/// row by row, to `out (rows * columns / merge^2, merge^2 * width)`.
 pub(super) fn pixel_shuffle(
     merge: usize,
     order: PatchOrder,

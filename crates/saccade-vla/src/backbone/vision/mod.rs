@@ -1,5 +1,5 @@
-//! The vision tower of a backbone: SigLIP's or that of Qwen3-VL. Views are encoded in batches, bounded by the memory
-//! of their activations.
+//! The vision tower of a backbone: SigLIP's or that of Qwen3-VL. Views are encoded in batches, bounded by the
+//! memory of their activations.
 
 mod block;
 mod connector;
@@ -26,8 +26,8 @@ use crate::error::Result;
 use crate::nn::weights::Weights;
 use crate::ops::check_interrupted;
 
-/// Patches that are encoded together. More read the weights less often; fewer keep the activations small: at 2048
-/// patches the weights are read once for 8 views, and the largest buffer is 35 MB at N1.5's size.
+/// Patches that are encoded together. More read the weights less often; fewer keep the activations small: at
+/// 2048 patches the weights are read once for 8 views, and the largest buffer is 35 MB at N1.5's size.
 const VISION_ROWS: usize = 2048;
 
 /// A vision tower with its connector.

@@ -13,8 +13,8 @@ const VISION_THETA: f64 = 10_000.0;
 /// A row or column of a resized table: rows or columns of the table, and how much each of them counts.
 pub(super) type Taps = Vec<(usize, f64)>;
 
-/// For each of `count` places the taps over `side` rows of a table: linear interpolation, widened where the table shrinks so that every row
-/// counts. With as many places as rows, each is its row.
+/// For each of `count` places the taps over `side` rows of a table: linear interpolation, widened where the
+/// table shrinks so that every row counts. With as many places as rows, each is its row.
 pub(super) fn antialiased(side: usize, count: usize) -> Vec<Taps> {
     let scale = side as f64 / count as f64;
     let support = scale.max(1.0);
@@ -31,7 +31,8 @@ pub(super) fn antialiased(side: usize, count: usize) -> Vec<Taps> {
         .collect()
 }
 
-/// For each of `count` places, evenly spaced from the first to the last of `side` rows of a table, the two rows around it.
+/// For each of `count` places, evenly spaced from the first to the last of `side` rows of a table, the two
+/// rows around it.
 pub(super) fn evenly_spaced(side: usize, count: usize) -> Vec<Taps> {
     (0..count)
         .map(|place| {
@@ -45,7 +46,8 @@ pub(super) fn evenly_spaced(side: usize, count: usize) -> Vec<Taps> {
         .collect()
 }
 
-/// Adds up the rows of `table (side * side, width)` that the taps of a patch's row and column name, to `out (width)`.
+/// Adds up the rows of `table (side * side, width)` that the taps of a patch's row and column name, to
+/// `out (width)`.
 pub(super) fn interpolate(table: Rows<'_>, side: usize, [rows, columns]: [&Taps; 2], out: &mut [f32]) {
     if let ([(row, _)], [(column, _)]) = (&rows[..], &columns[..]) {
         out.copy_from_slice(table.row(row * side + column));
@@ -62,14 +64,16 @@ pub(super) fn interpolate(table: Rows<'_>, side: usize, [rows, columns]: [&Taps;
     }
 }
 
-/// The rotation of the pairs of a vision tower's heads: the first half by the row of a patch, the second by its column.
+/// The rotation of the pairs of a vision tower's heads: the first half by the row of a patch, the second by
+/// its column.
 pub(super) fn vision_rope_pairs(config: &VisionConfig) -> Vec<RopePair> {
     let pairs = config.head_dim / 4;
     let of_axis = |axis| frequencies(VISION_THETA, pairs).map(move |frequency| RopePair { axis, frequency });
     of_axis(0).chain(of_axis(1)).collect()
 }
 
-/// The row and column of each patch of a view whose patches come in squares of `merge` on each side, square by square.
+/// The row and column of each patch of a view whose patches come in squares of `merge` on each side, square
+/// by square.
 pub(super) fn patch_places(merge: usize, [rows, columns]: [usize; 2]) -> Result<Vec<[usize; 2]>> {
     let mut places = Vec::new();
     reserve("positions", &mut places, rows * columns)?;

@@ -12,8 +12,8 @@ use crate::nn::rope::Rope;
 
 /// A vision tower with its connector.
 pub(super) trait VisionTower {
-    /// Writes `patches W^T + b + positions` to `x (patches, width)`; the angles by which heads are rotated, if they
-    /// are.
+    /// Writes `patches W^T + b + positions` to `x (patches, width)`; the angles by which heads are rotated,
+    /// if they are.
     ///
     /// # Errors
     /// [`Error::Memory`](crate::Error::Memory), [`Error::Interrupted`](crate::Error::Interrupted).
@@ -28,7 +28,8 @@ pub(super) trait VisionTower {
     /// The blocks, first to last.
     fn blocks(&self) -> &[VisionBlock];
 
-    /// The connector to the first layers of the language model that follows block number `block`, if one does.
+    /// The connector to the first layers of the language model that follows block number `block`, if one
+    /// does.
     fn deepstack(&self, _block: usize) -> Option<&Connector> {
         None
     }

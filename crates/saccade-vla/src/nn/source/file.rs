@@ -12,7 +12,8 @@ pub(crate) struct FileSource<'a> {
 }
 
 impl FileSource<'_> {
-    /// Calls `load` with tensors that are read ahead in the order `wanted`, whose names are without the prefix.
+    /// Calls `load` with tensors that are read ahead in the order `wanted`, whose names are without the
+    /// prefix.
     pub(crate) fn read_ahead<R>(
         checkpoint: &Checkpoint,
         prefix: &'static str,

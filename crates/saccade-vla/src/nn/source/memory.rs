@@ -121,7 +121,8 @@ pub(crate) fn shape_of<'a>(tensors: &'a TensorViews<'_>, name: &str) -> Option<&
     tensors.get(name).map(|tensor| tensor.shape.as_slice())
 }
 
-/// All problems of `tensors`: exactly the `expected` ones must be there, and those that `is_unused` knows may.
+/// All problems of `tensors`: exactly the `expected` ones must be there, and those that `is_unused` knows
+/// may.
 pub(crate) fn problems(
     tensors: &TensorViews<'_>,
     expected: &[TensorSpec],
@@ -151,7 +152,8 @@ pub(crate) fn check(problems: &[TensorProblem], list: impl Fn(&[TensorProblem]) 
     })
 }
 
-/// Tensors in memory as layers take them: each is copied when it is asked for, and the memory of the last copy is used again.
+/// Tensors in memory as layers take them: each is copied when it is asked for, and the memory of the last
+/// copy is used again.
 pub(crate) struct MemorySource<'a> {
     tensors: &'a TensorViews<'a>,
     spare: RefCell<Option<Elements>>,
