@@ -101,7 +101,7 @@ def test_calls_are_stopped_and_the_head_stays_usable(head: saccade.ActionHead, s
 
 
 def test_what_was_stopped_is_not_remembered(state: Any) -> None:
-    """Modulations and brackets are kept by bucket: those of a call that was stopped must not be."""
+    """Modulations and time biases are cached by timestep: those of a call that was stopped must not be."""
     fresh = saccade.ActionHead.from_pretrained(DEMO, num_threads=1)
     context = encoded(fresh)
     actions = np.zeros((1, 16, 4), np.float32)

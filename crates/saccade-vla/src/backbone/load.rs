@@ -10,10 +10,11 @@ use super::model::Backbone;
 use super::recognise::Recognised;
 use crate::engine::Engine;
 use crate::error::Result;
+use crate::nn::source::Source;
 use crate::nn::source::file::FileSource;
 use crate::nn::source::memory::{self, MemorySource, TensorViews};
 use crate::nn::source::planner::plan;
-use crate::nn::weights::{Builder, Source};
+use crate::nn::weights::Builder;
 use crate::options::setters;
 use crate::precision::Precision;
 
@@ -62,9 +63,10 @@ impl Backbone {
     /// ```
     ///
     /// # Errors
-    /// [`Error::File`] for a path that is not there; [`Error::Checkpoint`] for a config or weights that are
-    /// broken, not finite or do not fit each other (all that does not fit is listed); [`Error::Input`] for
-    /// options out of range; [`Error::Memory`].
+    /// [`Error::File`](crate::Error::File) for a path that is not there;
+    /// [`Error::Checkpoint`](crate::Error::Checkpoint) for a config or weights that are broken, not finite or
+    /// do not fit each other (all that does not fit is listed); [`Error::Input`](crate::Error::Input) for
+    /// options out of range; [`Error::Memory`](crate::Error::Memory).
     pub fn load(source: &Path, options: &BackboneLoadOptions) -> Result<Self> {
         let engine = Engine::new(options.precision, options.num_threads)?;
         let published = BackboneCheckpoint::open(source, options.config.as_deref())?;
@@ -84,9 +86,10 @@ impl Backbone {
     /// The tensors are borrowed for the call only.
     ///
     /// # Errors
-    /// [`Error::Checkpoint`] for a broken config, for tensors that are missing or unknown, and for weights
-    /// that are not finite; [`Error::Shape`] if shapes alone are wrong (all that is wrong is listed in both);
-    /// [`Error::Input`] for options out of range; [`Error::Memory`].
+    /// [`Error::Checkpoint`](crate::Error::Checkpoint) for a broken config, for tensors that are missing or
+    /// unknown, and for weights that are not finite; [`Error::Shape`](crate::Error::Shape) if shapes alone
+    /// are wrong (all that is wrong is listed in both); [`Error::Input`](crate::Error::Input) for options out
+    /// of range; [`Error::Memory`](crate::Error::Memory).
     pub fn from_tensors(tensors: &TensorViews<'_>, options: &BackboneLoadOptions) -> Result<Self> {
         let engine = Engine::new(options.precision, options.num_threads)?;
         let given = GivenConfig::parse(options.config.as_deref().unwrap_or("{}"))?;

@@ -3,7 +3,8 @@
 use half::bf16;
 use saccade_vla_checkpoint::Elements;
 
-use super::weights::{Tensor, Weights};
+use super::source::Tensor;
+use super::weights::Weights;
 use crate::error::Result;
 
 /// A row for each id, `weight (num_rows, width)`.

@@ -222,43 +222,6 @@ fn feed_forwards_of_any_hidden_width_and_activation() {
     }
 }
 
-#[test]
-fn gated_layers_multiply_the_activated_gate() {
-    let named = Named::new(&[
-        ("gate_proj.weight", &[9, 6]),
-        ("up_proj.weight", &[9, 6]),
-        ("down_proj.weight", &[6, 9]),
-    ]);
-    let (y, x) = (numbers(5 * 6, 1), numbers(5 * 6, 2));
-    let up = named.linear("up_proj", &widened(&y), 6);
-    let mut hidden = named.linear("gate_proj", &widened(&y), 6);
-    hidden
-        .iter_mut()
-        .zip(&up)
-        .for_each(|(gate, up)| *gate = *gate / (1.0 + (-*gate).exp()) * up);
-    let mut expected = named.linear("down_proj", &hidden, 9);
-    expected
-        .iter_mut()
-        .zip(&x)
-        .for_each(|(sum, x)| *sum += f64::from(*x));
-    let layers = named.layers(|weights| FeedForward::gated(weights, [6, 9], Epilogue::Silu));
-    assert_adds(layers, (&y, &x, 6), &expected, "gated", add_feed_forward);
-}
-
-#[test]
-fn rms_norms_of_rows() {
-    let named = Named::new(&[("weight", &[13])]);
-    let x = numbers(4 * 13, 3);
-    let mut expected = widened(&x);
-    rms_norm(&mut expected, &named.get("weight"), 1e-6);
-    for (engine, norm) in named.layers(|weights| RmsNorm::new(weights, 13, 1e-6)) {
-        let mut out = vec![0.0; x.len()];
-        norm.apply(engine, Rows::new(&x, 13), RowsMut::new(&mut out, 13))
-            .unwrap();
-        assert_close(&out, &expected, &engine.isa.to_string());
-    }
-}
-
 /// Qwen's names, with the biases of its second version.
 const QWEN_WITH_BIAS: Projections = Projections {
     qkv: Qkv::Separate(["q_proj", "k_proj", "v_proj"]),

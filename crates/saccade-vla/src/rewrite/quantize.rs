@@ -11,7 +11,7 @@ use crate::alloc::filled;
 use crate::backbone::BackboneCheckpoint;
 use crate::error::{Error, Result, problem};
 use crate::head::plan::tensor_specs;
-use crate::nn::weights::weight_view;
+use crate::nn::source::weight_view;
 use crate::ops::check_interrupted;
 use crate::rewrite::float::Float;
 use crate::rewrite::{RewriteOptions, SourceCheckpoint, Written};

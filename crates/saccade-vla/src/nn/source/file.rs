@@ -2,8 +2,8 @@
 
 use saccade_vla_checkpoint::{Checkpoint, Elements, ReadAhead, Wanted};
 
+use super::{Request, Source, Tensor};
 use crate::error::Result;
-use crate::nn::weights::{Request, Source, Tensor};
 
 /// The tensors under a prefix.
 pub(crate) struct FileSource<'a> {

@@ -8,9 +8,9 @@ use half::slice::HalfBitsSliceExt;
 use half::{bf16, f16};
 use safetensors::Dtype;
 
+use super::{Request, Source, Tensor};
 use crate::alloc::reserve;
 use crate::error::{Error, Problem, Result, problem, show_shape};
-use crate::nn::weights::{Request, Source, Tensor};
 use crate::ops::check_interrupted;
 use saccade_vla_checkpoint::spec::{self, TensorProblem};
 use saccade_vla_checkpoint::{Elements, TensorSpec};

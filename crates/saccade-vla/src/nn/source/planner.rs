@@ -6,9 +6,10 @@ use std::collections::BTreeSet;
 use saccade_vla_checkpoint::{TensorSpec, Wanted};
 use saccade_vla_kernels::Isa;
 
+use super::{Request, Source, Stored, Tensor};
 use crate::engine::Engine;
 use crate::error::Result;
-use crate::nn::weights::{Builder, Request, Source, Stored, Tensor, Weights};
+use crate::nn::weights::{Builder, Weights};
 use crate::precision::Precision;
 
 /// Notes every request.

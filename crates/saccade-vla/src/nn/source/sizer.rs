@@ -3,9 +3,10 @@
 use saccade_vla_kernels::{Element, PackedLinear};
 use safetensors::Dtype;
 
+use super::{Outline, Request, Source, Stored, Tensor};
 use crate::engine::Engine;
 use crate::error::Result;
-use crate::nn::weights::{Builder, Outline, Request, Source, Stored, Tensor, Weights};
+use crate::nn::weights::{Builder, Weights};
 use crate::ops::packing_error;
 use crate::precision::Role;
 
