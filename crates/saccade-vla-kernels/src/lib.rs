@@ -44,8 +44,6 @@ mod tiles;
 mod weights;
 
 pub use activation::{exp, gelu_erf, gelu_tanh, relu, silu};
-/// The name of [`AlignedVec`] until everything uses that.
-pub use aligned::AlignedVec as Activations;
 pub use aligned::{AlignedVec, AllocError};
 pub use attention::{LogitBias, Mask, PackedKeyValues, attention};
 pub use cpu::CpuReport;

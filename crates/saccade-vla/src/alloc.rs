@@ -1,6 +1,6 @@
 //! Memory whose size a caller decides: asked for, never assumed.
 
-use saccade_vla_kernels::{Activations, Rows, RowsMut};
+use saccade_vla_kernels::{AlignedVec, Rows, RowsMut};
 
 use crate::error::{Error, Result};
 use crate::ops::{check_interrupted, refused};
@@ -76,7 +76,7 @@ pub(crate) fn copied(what: &'static str, rows: Rows<'_>) -> Result<Vec<f32>> {
 /// first depends on earlier calls.
 #[derive(Default)]
 pub(crate) struct Scratch {
-    memory: Activations,
+    memory: AlignedVec,
     num_rows: usize,
     num_columns: usize,
 }
