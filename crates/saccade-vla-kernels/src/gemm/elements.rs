@@ -91,6 +91,7 @@ elements! {
     /// Rows rounded to bfloat16 by bfloat16 weights, in float32: for a CPU without an instruction for them.
     RoundedBf16 = "bf16-as-f32": RoundedF32 by Bf16, FloatSums;
     /// Pairs of bfloat16, by an instruction that multiplies and sums both of a pair.
+    #[allow(dead_code, reason = "not every architecture and set of features has such an instruction")]
     Bf16 = "bf16": Bf16 by Bf16, FloatSums;
     /// Quads of bytes: rows of unsigned ones, weights of signed ones.
     Int8 = "int8": UnsignedBytes by Int8, IntegerSums;

@@ -8,6 +8,10 @@
 pub(crate) mod broadcast;
 mod convert;
 pub(crate) mod elements;
+#[cfg_attr(
+    not(any(target_arch = "x86_64", feature = "software-tiles")),
+    allow(dead_code, reason = "no unit multiplies tiles there")
+)]
 pub(crate) mod in_tiles;
 pub(crate) mod in_vectors;
 mod name;
@@ -15,6 +19,10 @@ mod name;
 pub(crate) mod neon;
 pub(crate) mod outliers;
 mod pack;
+#[cfg_attr(
+    not(any(target_arch = "x86_64", feature = "software-tiles")),
+    allow(dead_code, reason = "no unit multiplies tiles there")
+)]
 mod prefetch;
 mod step;
 
