@@ -29,8 +29,6 @@ LAB = Extras(
             "safetensors": "safetensors>=0.4",
             "markdown_it": "markdown-it-py>=3",
             "pandas": "pandas>=2.1",
-            "sklearn": "scikit-learn>=1.4",
-            "threadpoolctl": "threadpoolctl>=3",
         },
         "ray": {"ray": "ray>=2.30"},
     },
@@ -38,7 +36,7 @@ LAB = Extras(
 )
 
 _PICTURES = ("matplotlib", "PIL")
-_TABLES = ("jinja2", "markdown_it", "pandas", "scipy", "sklearn", "threadpoolctl")
+_TABLES = ("jinja2", "markdown_it", "pandas", "scipy")
 _SIMULATOR = ("gymnasium", "metaworld", "mujoco", "packaging")
 #: The optional packages of each command, checked together once its arguments have been parsed.
 NEEDS: dict[str, tuple[str, ...]] = {

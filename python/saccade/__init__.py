@@ -81,7 +81,7 @@ _FUNCTIONS = {
     "accelerate": "saccade.integrations",
 }
 #: Public submodules, likewise.
-_SUBMODULES = ("checkpoints", "integrations", "observations", "robots", "serve", "torch")
+_SUBMODULES = ("checkpoints", "integrations", "linalg", "observations", "robots", "serve", "torch")
 
 # Hidden from type checkers, so that they report names that do not exist; they need `import saccade.serve`.
 if not TYPE_CHECKING:

@@ -12,6 +12,7 @@ _Float32 = npt.NDArray[np.float32]
 _Bool = npt.NDArray[np.bool_]
 _Bytes = npt.NDArray[np.uint8]  # of a mask: 0 is False
 _Int64 = npt.NDArray[np.int64]
+_Float64 = npt.NDArray[np.float64]
 _Frame = npt.NDArray[np.uint8] | npt.NDArray[np.float32] | npt.NDArray[np.float64]
 
 _Recorded = tuple[dict[Any, _Float32], dict[Any, _Float32]]  # attention and hidden rows, by place
@@ -20,6 +21,7 @@ _BackboneRecorded = tuple[list[_Float32], list[list[_Float32]], list[list[_Float
 _Intervention = dict[str, Any]  # the fields of saccade.Intervention, mappings as lists of their items
 
 __all__ = [
+    "PCA",
     "ActionHead",
     "Backbone",
     "BackboneCheckpoint",
@@ -30,16 +32,20 @@ __all__ = [
     "KeyValues",
     "Processor",
     "ProcessorSource",
+    "Ridge",
+    "Standardizer",
     "__version__",
     "available_isas",
     "convert",
     "cpu_report",
     "default_num_threads",
     "dot_products",
+    "linear_cka",
     "measure_peaks",
     "merge_future_tokens",
     "panic_in_core",
     "parse_config",
+    "principal_angles",
     "profile",
     "quantize",
     "read_stored",
@@ -270,6 +276,43 @@ class CrossAttention:
         weights: _Float32 | None,
         out: _Float32,
     ) -> None: ...
+
+@final
+class Standardizer:
+    @staticmethod
+    def fit(x: _Float64, scaled: bool) -> Standardizer: ...
+    @property
+    def mean(self) -> _Float64: ...
+    @property
+    def scale(self) -> _Float64: ...
+    def transform(self, x: _Float64) -> _Float64: ...
+
+@final
+class PCA:
+    @staticmethod
+    def fit(x: _Float64, components: int) -> PCA: ...
+    @property
+    def mean(self) -> _Float64: ...
+    @property
+    def components(self) -> _Float64: ...
+    @property
+    def explained_variance(self) -> _Float64: ...
+    @property
+    def total_variance(self) -> float: ...
+    def transform(self, x: _Float64) -> _Float64: ...
+
+@final
+class Ridge:
+    @staticmethod
+    def fit(x: _Float64, y: _Float64, alphas: _Float64) -> Ridge: ...
+    @property
+    def weights(self) -> _Float64: ...
+    @property
+    def intercepts(self) -> _Float64: ...
+    def predict(self, x: _Float64) -> _Float64: ...
+
+def linear_cka(x: _Float64, y: _Float64) -> float: ...
+def principal_angles(a: _Float64, b: _Float64) -> _Float64: ...
 
 @final
 class HeadCheckpoint:

@@ -19,7 +19,7 @@ PACKAGES = {
     "lab": ROOT / "lab/saccade_lab",
     "plugin": ROOT / "plugins/lerobot/lerobot_policy_saccade",
 }
-LAZY = ("checkpoints", "integrations", "observations", "robots", "serve", "torch")
+LAZY = ("checkpoints", "integrations", "linalg", "observations", "robots", "serve", "torch")
 
 
 def python(code: str) -> str:

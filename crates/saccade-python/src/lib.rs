@@ -13,6 +13,7 @@ mod detached;
 mod error;
 mod head;
 mod intervention;
+mod linalg;
 mod machine;
 mod processor;
 mod rewrite;
@@ -35,6 +36,8 @@ mod _saccade {
     use crate::detached::panic_in_core;
     #[pymodule_export]
     use crate::head::ActionHead;
+    #[pymodule_export]
+    use crate::linalg::{Pca, Ridge, Standardizer, linear_cka, principal_angles};
     #[pymodule_export]
     use crate::machine::{
         PyProfile, StayOnThisThread, available_isas, cpu_report, default_num_threads, dot_products,

@@ -123,17 +123,17 @@ impl<'a, T> ArrayMut<'a, T> {
 
 /// An array that owns its elements.
 #[derive(Clone, Debug, PartialEq)]
-pub struct OwnedArray {
-    data: Vec<f32>,
+pub struct OwnedArray<T = f32> {
+    data: Vec<T>,
     shape: Vec<usize>,
 }
 
-impl OwnedArray {
+impl<T> OwnedArray<T> {
     /// `data` with `shape`, last axis fastest.
     ///
     /// # Errors
     /// [`Error::Shape`] if the sizes in `shape` do not multiply to the length of `data`.
-    pub fn new(data: Vec<f32>, shape: &[usize]) -> Result<Self> {
+    pub fn new(data: Vec<T>, shape: &[usize]) -> Result<Self> {
         check_length(data.len(), shape)?;
         Ok(Self {
             data,
@@ -143,13 +143,13 @@ impl OwnedArray {
 
     /// The elements, last axis fastest.
     #[must_use]
-    pub fn data(&self) -> &[f32] {
+    pub fn data(&self) -> &[T] {
         &self.data
     }
 
     /// The elements, to be written.
     #[must_use]
-    pub fn data_mut(&mut self) -> &mut [f32] {
+    pub fn data_mut(&mut self) -> &mut [T] {
         &mut self.data
     }
 
@@ -161,22 +161,24 @@ impl OwnedArray {
 
     /// The array, borrowed.
     #[must_use]
-    pub fn view(&self) -> Array<'_> {
+    pub fn view(&self) -> Array<'_, T> {
         Array {
             data: &self.data,
             shape: &self.shape,
         }
     }
 
+    /// The elements and the size of each axis.
+    #[must_use]
+    pub fn into_parts(self) -> (Vec<T>, Vec<usize>) {
+        (self.data, self.shape)
+    }
+}
+
+impl OwnedArray {
     /// The elements as rows of the last axis.
     pub(crate) fn rows(&self) -> Rows<'_> {
         Rows::new(&self.data, self.shape.last().copied().unwrap_or(1))
-    }
-
-    /// The elements and the size of each axis.
-    #[must_use]
-    pub fn into_parts(self) -> (Vec<f32>, Vec<usize>) {
-        (self.data, self.shape)
     }
 }
 

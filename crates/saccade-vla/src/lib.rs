@@ -8,7 +8,7 @@
 //! - Backbone: [`Backbone::encode`] turns pixels and token ids into features, and reuses what an earlier call computed of the same views.
 //! - Processor (feature `processor`): [`Processor::process`] turns frames and an instruction into those pixels and ids.
 //! - Inspection: an [`Intervention`] cuts attention, adds biases to keys, or replaces rows; [`ActionHead::trace`] records what goes on
-//!   inside.
+//!   inside, [`linalg`] has ridge regression, principal components, CKA and principal angles for it.
 //! - Checkpoints: [`HeadCheckpoint`] and [`BackboneCheckpoint`] are open and not loaded; [`convert`], [`quantize`] and [`resize`] (feature
 //!   `rewrite`) write changed copies. Files are read by [`files`].
 //!
@@ -56,6 +56,7 @@ pub use head::sample::Sampling;
 pub use head::velocity::NoisyActions;
 pub use inspect::groups::{Group, Groups, Tokens};
 pub use inspect::intervention::{Intervention, Patch};
+pub use inspect::linalg;
 pub use inspect::trace::{Keep, Recorded, StepBlock, Trace, TraceOptions};
 pub use nn::source::memory::{ElementsRef, TensorView, TensorViews};
 pub use ops::interruptible;

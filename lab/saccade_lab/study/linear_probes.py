@@ -9,12 +9,10 @@ from typing import Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
-from sklearn.decomposition import PCA
-from sklearn.linear_model import Ridge
-from sklearn.model_selection import GroupKFold, StratifiedGroupKFold
-from sklearn.preprocessing import StandardScaler
 
 from saccade._internal.files import write_atomically
+from saccade.linalg import PCA, Ridge, Standardizer
+from saccade_lab.study.folds import grouped_folds, stratified_folds
 from saccade_lab.study.statistics import CONFIDENCE, Estimate
 
 FOLDS, INNER_FOLDS = 5, 4
@@ -91,18 +89,18 @@ def held_out_errors(
     found = {name: (np.zeros(len(values)), np.zeros(len(values))) for name in targets}
     asked = np.concatenate(list(targets.values()), axis=1, dtype=np.float64)  # (frames, all coordinates)
     owners = np.repeat(np.arange(len(targets)), [target.shape[1] for target in targets.values()])
-    splitter = StratifiedGroupKFold(FOLDS, shuffle=True, random_state=0)
-    for train, test in splitter.split(values, frames.tasks, frames.episodes):
+    for train, test in stratified_folds(frames.tasks, frames.episodes, FOLDS, seed=0):
         inputs = values - task_means(values, frames.tasks, train)
         expected = asked - task_means(asked, frames.tasks, train)
-        scaler = StandardScaler().fit(inputs[train])
-        reduction = PCA(min(dimensions, len(train) - 1, values.shape[1]), random_state=0)
-        with np.errstate(invalid="ignore"):  # rows that encode only the task are all zeros now
-            known = reduction.fit_transform(scaler.transform(inputs[train])).astype(np.float64)
-        scale = np.sqrt(np.mean(np.square(known))) or 1.0
-        new = reduction.transform(scaler.transform(inputs[test])).astype(np.float64) / scale
-        penalties = best_penalties(known / scale, expected[train], owners, frames.episodes[train])
-        predicted = Ridge(alpha=penalties[owners]).fit(known / scale, expected[train]).predict(new)
+        scaler = Standardizer(inputs[train])
+        standard = scaler.transform(inputs[train])
+        reduction = PCA(standard, min(dimensions, len(train) - 1, values.shape[1]))
+        known = reduction.transform(standard)
+        scale = np.sqrt(np.mean(np.square(known))) or 1.0  # rows that encode only the task are all zeros now
+        known, new = known / scale, reduction.transform(scaler.transform(inputs[test])) / scale
+        best = best_penalties(known, expected[train], owners, frames.episodes[train])
+        for_each = Ridge(known, expected[train], PENALTIES).predict(new)  # (penalties, frames, coordinates)
+        predicted = for_each[best[owners], :, np.arange(len(owners))].T
         for owner, (errors, spreads) in enumerate(found.values()):
             errors[test] = np.square(predicted - expected[test])[:, owners == owner].sum(axis=1)
             spreads[test] = np.square(expected[test])[:, owners == owner].sum(axis=1)
@@ -114,10 +112,8 @@ def best_penalties(
     targets: FloatArray,
     owners: npt.NDArray[np.int64],
     episodes: npt.NDArray[np.int64],
-) -> FloatArray:
-    """The penalty of ``PENALTIES`` with the least error in a cross-validation by episode, for each target.
-
-    One decomposition serves all penalties and targets.
+) -> npt.NDArray[np.int64]:
+    """Which of ``PENALTIES`` has the least error in a cross-validation by episode, for each target.
 
     Args:
         values: ``(frames, dimensions)``.
@@ -126,19 +122,14 @@ def best_penalties(
         episodes: ``(frames,)``.
 
     Returns:
-        ``(targets,)``.
+        ``(targets,)``, positions in ``PENALTIES``.
     """
     errors = np.zeros((len(PENALTIES), targets.shape[1]))
-    for train, test in GroupKFold(INNER_FOLDS).split(values, groups=episodes):
-        mean, offset = values[train].mean(axis=0), targets[train].mean(axis=0)
-        left, singular, right = np.linalg.svd(values[train] - mean, full_matrices=False)
-        projected = left.T @ (targets[train] - offset)  # (dimensions, coordinates)
-        for place, penalty in enumerate(PENALTIES):
-            weights = right.T @ (projected * (singular / (singular**2 + penalty))[:, None])
-            predicted = (values[test] - mean) @ weights + offset
-            errors[place] += np.square(predicted - targets[test]).sum(axis=0)
+    for train, test in grouped_folds(episodes, INNER_FOLDS):
+        predicted = Ridge(values[train], targets[train], PENALTIES).predict(values[test])
+        errors += np.square(predicted - targets[test]).sum(axis=1)
     by_target = np.stack([errors[:, owners == owner].sum(axis=1) for owner in np.unique(owners)])
-    best: FloatArray = np.asarray(PENALTIES)[by_target.argmin(axis=1)]
+    best: npt.NDArray[np.int64] = by_target.argmin(axis=1)
     return best
 
 
@@ -174,7 +165,9 @@ def explained(
     Returns:
         1 - errors / spreads, and ``(resamples,)`` of the same.
     """
-    return float(1 - errors.sum() / spreads.sum()), 1 - (draws @ errors) / (draws @ spreads)
+    # Sums instead of products of matrices, whose last bits depend on the number of threads.
+    drawn = 1 - (draws * errors).sum(axis=1) / (draws * spreads).sum(axis=1)
+    return float(1 - errors.sum() / spreads.sum()), drawn
 
 
 def estimate(value: float, drawn: FloatArray) -> Estimate:

@@ -34,7 +34,7 @@ from saccade_lab.study.table import (
     write_table,
 )
 
-RECORDED_PACKAGES = ("numpy", "scipy", "torch", "mujoco", "metaworld", "scikit-learn")
+RECORDED_PACKAGES = ("numpy", "scipy", "torch", "mujoco", "metaworld")
 
 
 class StudyError(SaccadeError):

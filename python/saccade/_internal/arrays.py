@@ -34,6 +34,7 @@ PRECISIONS = ("float32", "bfloat16", "int8")
 LARGEST_RANGE = 1 << 20
 
 Float32Array: TypeAlias = npt.NDArray[np.float32]
+Float64Array: TypeAlias = npt.NDArray[np.float64]
 UInt8Array: TypeAlias = npt.NDArray[np.uint8]
 #: A tensor as the engine takes it: float32, or the name of a 16-bit type and the bits.
 StoredTensor: TypeAlias = "Float32Array | tuple[str, npt.NDArray[np.uint16]]"
@@ -56,9 +57,7 @@ def float32(name: str, value: ArrayLike) -> Float32Array:
     the engine refuses.
     """
     if is_torch(value):
-        if not value.dtype.is_floating_point:  # type: ignore[union-attr]
-            raise DtypeError(f"{name}: expected floating point values, got {value.dtype}")  # type: ignore[union-attr]
-        value = _torch_memory(name, value, sys.modules["torch"].float32)
+        value = _torch_floats(name, value, "float32")
     array = _asarray(name, value)
     # The case of a control loop. The rest takes a microsecond or two, as long as all other checks of a call.
     if array.dtype == FLOAT32 and array.flags.carray:
@@ -68,6 +67,22 @@ def float32(name: str, value: ArrayLike) -> Float32Array:
         raise DtypeError(f"{name}: expected floating point values, got {array.dtype}")
     with np.errstate(over="ignore"):
         return np.require(array, np.float32, ["C", "A"])
+
+
+def float64(name: str, value: ArrayLike) -> Float64Array:
+    """``value`` as a C-contiguous float64 array; integers are converted too."""
+    if is_torch(value) and value.dtype.is_floating_point:  # type: ignore[union-attr]
+        value = _torch_floats(name, value, "float64")
+    array = _asarray(name, value)
+    if array.dtype.kind not in "iuf" and array.dtype.name != "bfloat16":
+        raise DtypeError(f"{name}: expected numbers, got {array.dtype}")
+    return np.require(array, np.float64, ["C", "A"])
+
+
+def _torch_floats(name: str, tensor: Any, dtype: str) -> npt.NDArray[Any]:
+    if not tensor.dtype.is_floating_point:
+        raise DtypeError(f"{name}: expected floating point values, got {tensor.dtype}")
+    return _torch_memory(name, tensor, getattr(sys.modules["torch"], dtype))
 
 
 def exact_float32(name: str, value: ArrayLike) -> Float32Array:

@@ -81,12 +81,9 @@ def r2_of_positions(frames: Sequence[Frames], numbers: Sequence[int]) -> Mapping
     Returns:
         By input; empty with fewer episodes than `FOLDS`, or if nothing moves.
     """
-    import threadpoolctl  # type: ignore[import-untyped]
-
     if len(frames) < FOLDS:
         return {}
-    with threadpoolctl.threadpool_limits(1):
-        rows = probe(join(frames, numbers), DIMENSIONS)
+    rows = probe(join(frames, numbers), DIMENSIONS)
     found: dict[Input, list[float]] = {}
     for row in rows:
         found.setdefault((row["rows"], row["block"], row["tokens"]), []).append(row["r2"])

@@ -322,9 +322,7 @@ sys.exit(main(["study", "report", sys.argv[1]]))
 
 def test_without_packages_the_report_asks_for_the_extra_that_it_needs(tmp_path: Path) -> None:
     write_cuts(tmp_path)
-    missing = (
-        "jinja2,markdown_it,matplotlib,pandas,scipy,sklearn,joblib,torch,mujoco,gymnasium,metaworld,rich"
-    )
+    missing = "jinja2,markdown_it,matplotlib,pandas,scipy,joblib,torch,mujoco,gymnasium,metaworld,rich"
     command = [sys.executable, "-c", BARE, str(tmp_path), missing]
     done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode == 2

@@ -5,6 +5,7 @@ mod check;
 pub(crate) mod extent;
 pub(crate) mod groups;
 pub(crate) mod intervention;
+pub mod linalg;
 #[cfg(test)]
 mod tests;
 pub(crate) mod trace;

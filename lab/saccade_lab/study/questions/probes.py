@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 import pandas as pd
-import threadpoolctl  # type: ignore[import-untyped]
 
 from saccade._internal.flags import add_integer
 from saccade.errors import InputError
@@ -147,8 +146,7 @@ class Probes(Study):
                     self.record(task, seed)
                 parts.append(load_frames(self.path(task, seed)))
                 numbers.append(tasks.index(task))
-        with threadpoolctl.threadpool_limits(1):
-            found = probe(join(parts, numbers), self.dimensions)
+        found = probe(join(parts, numbers), self.dimensions)
         return [{"kind": "probe", "task": scope, **row} for row in found]
 
     def path(self, task: str, seed: int) -> Path:
