@@ -31,9 +31,8 @@ mod parts;
 #[cfg(feature = "peak")]
 pub mod peak;
 mod pool;
-mod rope;
+mod rotary;
 mod rows;
-#[allow(dead_code, reason = "kernels move to its tokens one by one")]
 mod simd;
 mod threads;
 #[cfg_attr(
@@ -59,7 +58,7 @@ pub use norm::rms::{rms_norm, rms_norm_in_place};
 pub use pool::{
     Interrupted, StayOnThisThread, interrupted, interruptible, parallel_for, stay_on_this_thread,
 };
-pub use rope::rotary_embedding;
+pub use rotary::rotary_embedding;
 pub use rows::{Rows, RowsMut};
 pub use threads::{NUM_THREADS_VARIABLE, NumThreadsError, default_num_threads};
 pub use weights::{Arithmetic, Element, WeightRef, quantize_rows};

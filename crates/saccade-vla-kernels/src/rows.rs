@@ -1,7 +1,16 @@
 //! Views of matrices whose rows are contiguous.
 
+mod shape;
+mod shared;
+#[cfg(test)]
+mod tests;
+
 use std::marker::PhantomData;
+use std::mem::MaybeUninit;
 use std::ops::Range;
+
+use shape::RowShape;
+pub(crate) use shared::SharedRows;
 
 /// A matrix `(num_rows, num_columns)` whose rows are contiguous, with any number of elements from one row to
 /// the next.
@@ -56,107 +65,27 @@ impl<T> Clone for Rows<'_, T> {
 
 impl<T> Copy for Rows<'_, T> {}
 
-/// How many rows and columns, and elements from one row to the next.
-#[derive(Clone, Copy, Debug)]
-struct RowShape {
-    num_rows: usize,
-    num_columns: usize,
-    row_stride: usize,
-}
-
-impl RowShape {
-    /// Of `len` elements as rows of `num_columns`.
-    #[track_caller]
-    fn contiguous(len: usize, num_columns: usize) -> Self {
-        let num_rows = len.checked_div(num_columns).unwrap_or(0);
-        assert_eq!(
-            num_rows * num_columns,
-            len,
-            "data: expected whole rows of {num_columns} elements"
-        );
-        Self {
-            num_rows,
-            num_columns,
-            row_stride: num_columns,
+/// The sizes of both views.
+macro_rules! sizes {
+    () => {
+        /// Number of rows.
+        #[must_use]
+        pub fn num_rows(&self) -> usize {
+            self.shape.num_rows
         }
-    }
 
-    /// Of `len` elements, which must hold all rows.
-    #[track_caller]
-    fn strided(len: usize, num_rows: usize, num_columns: usize, row_stride: usize) -> Self {
-        let end = match num_rows.checked_sub(1) {
-            Some(last) if num_columns > 0 => last
-                .checked_mul(row_stride)
-                .and_then(|last| last.checked_add(num_columns)),
-            _ => Some(0),
-        };
-        assert!(
-            end.is_some_and(|end| end <= len),
-            "data: expected room for {num_rows} rows of {num_columns} elements, {row_stride} apart, got {len} elements"
-        );
-        Self {
-            num_rows,
-            num_columns,
-            // Rows without elements are all at the beginning, wherever that is: no pointer to one is outside
-            // the data.
-            row_stride: if num_columns == 0 { 0 } else { row_stride },
+        /// Elements of a row.
+        #[must_use]
+        pub fn num_columns(&self) -> usize {
+            self.shape.num_columns
         }
-    }
 
-    /// The elements of row `row`.
-    #[track_caller]
-    #[inline]
-    fn row(&self, row: usize) -> Range<usize> {
-        assert!(row < self.num_rows, "row {row} of {}", self.num_rows);
-        // The data may end before a row without elements.
-        let first = if self.num_columns == 0 {
-            0
-        } else {
-            row * self.row_stride
-        };
-        first..first + self.num_columns
-    }
-
-    /// The shape of some of the rows, and where they begin.
-    #[track_caller]
-    fn rows(&self, rows: &Range<usize>) -> (Self, usize) {
-        assert!(
-            rows.start <= rows.end && rows.end <= self.num_rows,
-            "rows {rows:?} of {}",
-            self.num_rows
-        );
-        let part = Self {
-            num_rows: rows.len(),
-            ..*self
-        };
-        (
-            part,
-            if part.is_empty() {
-                0
-            } else {
-                rows.start * self.row_stride
-            },
-        )
-    }
-
-    /// The shape of some of the columns, and where they begin.
-    #[track_caller]
-    fn columns(&self, columns: &Range<usize>) -> (Self, usize) {
-        assert!(
-            columns.start <= columns.end && columns.end <= self.num_columns,
-            "columns {columns:?} of {}",
-            self.num_columns
-        );
-        let part = Self {
-            num_columns: columns.len(),
-            ..*self
-        };
-        (part, if part.is_empty() { 0 } else { columns.start })
-    }
-
-    fn is_empty(&self) -> bool {
-        self.num_rows == 0 || self.num_columns == 0
-    }
+        /// Elements from one row to the next.
+        #[must_use]
+        pub fn row_stride(&self) -> usize {
+            self.shape.row_stride
+        }
+    };
 }
 
 impl<'a, T> Rows<'a, T> {
@@ -182,6 +111,23 @@ impl<'a, T> Rows<'a, T> {
         Self::of(data.as_ptr(), shape)
     }
 
+    /// As [`Self::strided`], of memory that is initialised where the rows are.
+    ///
+    /// # Safety
+    /// The elements of all rows are initialised.
+    ///
+    /// # Panics
+    /// If `data` is too short.
+    pub(crate) unsafe fn initialised(
+        data: &'a [MaybeUninit<T>],
+        num_rows: usize,
+        num_columns: usize,
+        row_stride: usize,
+    ) -> Self {
+        let rows = Rows::strided(data, num_rows, num_columns, row_stride);
+        Self::of(rows.first.cast(), rows.shape)
+    }
+
     fn of(first: *const T, shape: RowShape) -> Self {
         let borrowed = PhantomData;
         Self {
@@ -191,23 +137,7 @@ impl<'a, T> Rows<'a, T> {
         }
     }
 
-    /// Number of rows.
-    #[must_use]
-    pub fn num_rows(&self) -> usize {
-        self.shape.num_rows
-    }
-
-    /// Elements of a row.
-    #[must_use]
-    pub fn num_columns(&self) -> usize {
-        self.shape.num_columns
-    }
-
-    /// Elements from one row to the next.
-    #[must_use]
-    pub fn row_stride(&self) -> usize {
-        self.shape.row_stride
-    }
+    sizes!();
 
     /// Row number `row`.
     ///
@@ -344,23 +274,7 @@ impl<'a, T> RowsMut<'a, T> {
         }
     }
 
-    /// Number of rows.
-    #[must_use]
-    pub fn num_rows(&self) -> usize {
-        self.shape.num_rows
-    }
-
-    /// Elements of a row.
-    #[must_use]
-    pub fn num_columns(&self) -> usize {
-        self.shape.num_columns
-    }
-
-    /// Elements from one row to the next.
-    #[must_use]
-    pub fn row_stride(&self) -> usize {
-        self.shape.row_stride
-    }
+    sizes!();
 
     /// Row number `row`.
     ///
@@ -419,11 +333,6 @@ impl<'a, T> RowsMut<'a, T> {
         let (shape, start) = self.shape.columns(&columns);
         Self::of(self.first.wrapping_add(start), shape)
     }
-
-    /// The first element of the first row.
-    pub(crate) fn as_mut_ptr(&mut self) -> *mut T {
-        self.first
-    }
 }
 
 impl<T: Copy> RowsMut<'_, T> {
@@ -446,138 +355,5 @@ impl<T: Copy> RowsMut<'_, T> {
     /// Sets all elements of all rows to `value`.
     pub fn fill(&mut self, value: T) {
         self.iter_mut().for_each(|row| row.fill(value));
-    }
-}
-
-/// Rows that the tasks of a loop write to, each a block of its own.
-pub(crate) struct SharedRows<'a, T = f32>(RowsMut<'a, T>);
-
-// SAFETY: elements are reached through `block` alone, whose callers use no element twice at a time.
-unsafe impl<T: Send> Sync for SharedRows<'_, T> {}
-
-impl<'a, T> SharedRows<'a, T> {
-    pub(crate) fn new(rows: RowsMut<'a, T>) -> Self {
-        Self(rows)
-    }
-
-    /// Some columns of some rows.
-    ///
-    /// # Safety
-    /// No two blocks that exist at the same time have an element in common.
-    ///
-    /// # Panics
-    /// If not all of them exist.
-    #[track_caller]
-    pub(crate) unsafe fn block(&self, rows: Range<usize>, columns: Range<usize>) -> RowsMut<'_, T> {
-        RowsMut::of(self.0.first, self.0.shape)
-            .rows(rows)
-            .columns(columns)
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    fn counted(len: usize) -> Vec<u32> {
-        (0..).take(len).collect()
-    }
-
-    #[test]
-    fn parts_of_rows_are_where_they_should_be() {
-        let mut data = counted(23);
-        let x = Rows::strided(&data, 4, 5, 6);
-        assert_eq!((x.num_rows(), x.num_columns(), x.row_stride()), (4, 5, 6));
-        assert_eq!(x.rows(1..3).columns(2..4).row(1), [14, 15]);
-        assert_eq!(x.columns(4..5).rows(3..4).row(0), [22]);
-        assert_eq!(x.rows(4..4).num_rows(), 0);
-        assert_eq!(x.columns(5..5).row(3), [0_u32; 0]);
-        let mut out = RowsMut::strided(&mut data, 4, 5, 6);
-        out.reborrow().rows(1..2).columns(1..3).row_mut(0).fill(100);
-        assert_eq!(out.as_rows().row(1), [6, 100, 100, 9, 10]);
-    }
-
-    #[test]
-    fn rows_are_visited_copied_and_filled_without_what_is_between_them() {
-        let (source, mut data) = (counted(8), vec![100; 11]);
-        let x = Rows::strided(&source, 3, 2, 3);
-        assert_eq!(x.iter().collect::<Vec<_>>(), [[0, 1], [3, 4], [6, 7]]);
-        let mut out = RowsMut::strided(&mut data, 3, 2, 4);
-        out.copy_from(x);
-        out.reborrow().rows(1..2).fill(9);
-        assert_eq!(data, [0, 1, 100, 100, 9, 9, 100, 100, 6, 7, 100]);
-        let mut one = RowsMut::strided(&mut data, 1, 2, 0);
-        assert_eq!(one.iter_mut().count(), 1);
-        let mut empty = RowsMut::strided(&mut data, 3, 0, 0);
-        assert!(empty.iter_mut().len() == 3 && empty.iter_mut().all(|row| row.is_empty()));
-    }
-
-    #[test]
-    fn blocks_of_shared_rows_are_apart() {
-        let mut data = counted(24);
-        let shared = SharedRows::new(RowsMut::strided(&mut data, 4, 5, 6));
-        // SAFETY: the two have no element in common.
-        let (mut left, mut right) = unsafe { (shared.block(1..3, 0..2), shared.block(0..4, 2..5)) };
-        left.fill(100);
-        right.row_mut(3).fill(200);
-        assert_eq!(left.as_rows().row(1), [100, 100]);
-        assert_eq!(right.as_rows().row(1), [8, 9, 10]);
-        assert_eq!(data[18..], [18, 19, 200, 200, 200, 23]);
-        assert_eq!(data[6..14], [100, 100, 8, 9, 10, 11, 100, 100]);
-    }
-
-    #[test]
-    fn contiguous_rows_are_joined() {
-        let data = counted(13);
-        let joined = Rows::strided(&data, 6, 2, 2).joined(3);
-        assert_eq!((joined.num_rows(), joined.row(1)), (2, &[6, 7, 8, 9, 10, 11][..]));
-    }
-
-    #[test]
-    #[should_panic(expected = "expected contiguous rows, 2 in each")]
-    fn rows_that_are_apart_are_not_joined() {
-        let _ = Rows::strided(&[0.0; 9], 2, 2, 3).joined(2);
-    }
-
-    #[test]
-    fn views_without_elements() {
-        let none: [f32; 0] = [];
-        assert_eq!(Rows::new(&none, 7).num_rows(), 0);
-        assert_eq!(Rows::new(&none, 0).num_rows(), 0);
-        for row_stride in [0, 5] {
-            let x = Rows::strided(&none, 3, 0, row_stride);
-            assert_eq!((x.num_rows(), x.row(2)), (3, &none[..]));
-            assert_eq!(x.row_stride(), 0, "no pointer to a row leaves the data");
-        }
-    }
-
-    #[test]
-    #[should_panic(expected = "data: expected whole rows of 4 elements")]
-    fn a_part_of_a_row_is_refused() {
-        let _ = Rows::new(&[0.0; 7], 4);
-    }
-
-    #[test]
-    #[should_panic(expected = "data: expected room for 3 rows of 2 elements, 4 apart, got 9 elements")]
-    fn data_that_is_too_short_is_refused() {
-        let _ = Rows::strided(&[0.0; 9], 3, 2, 4);
-    }
-
-    #[test]
-    #[should_panic(expected = "data: expected room")]
-    fn a_size_that_overflows_is_refused() {
-        let _ = Rows::strided(&[0.0; 9], usize::MAX, 2, usize::MAX / 2);
-    }
-
-    #[test]
-    #[should_panic(expected = "row_stride: expected at least the 3 elements of a row, got 2")]
-    fn rows_to_write_that_overlap_are_refused() {
-        let _ = RowsMut::strided(&mut [0.0; 9], 3, 3, 2);
-    }
-
-    #[test]
-    #[should_panic(expected = "rows 1..4 of 3")]
-    fn rows_that_are_not_there_are_refused() {
-        let _ = Rows::new(&[0.0; 6], 2).rows(1..4);
     }
 }

@@ -41,9 +41,9 @@ pub(super) trait Multiply<S: Simd, A> {
 
 /// Vectors. Their products are a piece of code of their own for each arithmetic: their tiles are many, and
 /// compilers take minutes over them.
-pub(super) struct InVectors;
+pub(super) struct VectorProducts;
 
-impl<S: Simd, T: Stored> Multiply<S, Float32Products<T>> for InVectors {
+impl<S: Simd, T: Stored> Multiply<S, Float32Products<T>> for VectorProducts {
     const KEYS: usize = S::LANES;
 
     #[inline(always)]
@@ -53,7 +53,7 @@ impl<S: Simd, T: Stored> Multiply<S, Float32Products<T>> for InVectors {
     }
 }
 
-impl<S: Simd> Multiply<S, Bf16Products> for InVectors {
+impl<S: Simd> Multiply<S, Bf16Products> for VectorProducts {
     const KEYS: usize = S::LANES;
 
     #[inline(always)]

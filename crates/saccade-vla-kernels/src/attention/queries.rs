@@ -7,7 +7,7 @@ use std::ops::Range;
 use super::arithmetic::{Bf16Products, Float32Products, StoredBf16, StoredF32, TileArithmetic};
 use super::keys_values::PackedKeyValues;
 use super::mask::Mask;
-use super::product::{AttentionProduct, InVectors, Multiply, Operands, Removed};
+use super::product::{AttentionProduct, Multiply, Operands, Removed, VectorProducts};
 use super::softmax::{Row, Running};
 use crate::rows::{Rows, RowsMut};
 use crate::simd::bits::write_uninit;
@@ -59,7 +59,7 @@ impl Kernel for AttendF32<'_> {
     #[inline(always)]
     fn run<S: Simd>(mut self, simd: S) {
         self.0
-            .run::<S, Float32Products<StoredF32>, _, MAX_TILE_ROWS>(simd, &mut InVectors);
+            .run::<S, Float32Products<StoredF32>, _, MAX_TILE_ROWS>(simd, &mut VectorProducts);
     }
 }
 
@@ -71,10 +71,10 @@ impl Kernel for AttendBf16<'_> {
     fn run<S: Simd>(mut self, simd: S) {
         if S::HAS_DOT_BF16 {
             self.0
-                .run::<S, Bf16Products, _, MAX_TILE_ROWS>(simd, &mut InVectors);
+                .run::<S, Bf16Products, _, MAX_TILE_ROWS>(simd, &mut VectorProducts);
         } else {
             self.0
-                .run::<S, Float32Products<StoredBf16>, _, MAX_TILE_ROWS>(simd, &mut InVectors);
+                .run::<S, Float32Products<StoredBf16>, _, MAX_TILE_ROWS>(simd, &mut VectorProducts);
         }
     }
 }

@@ -3,8 +3,6 @@
 //! Models have a few channels a hundred times as large as the rest. A row that is quantised over the range of all of its
 //! elements has few steps left for the others. Which elements are kept apart depends on their row alone.
 
-use std::mem::MaybeUninit;
-
 use crate::aligned::Zeroable;
 use crate::simd::{Kernel, Simd};
 
@@ -98,8 +96,8 @@ pub(crate) struct MultiplyOutliers<'a> {
     pub columns: usize,
     /// Words of a column next to each other in the panel.
     pub run: usize,
-    /// Rows of `columns` sums; those of rows that have outliers are written.
-    pub sums: &'a mut [MaybeUninit<f32>],
+    /// Rows of `columns` sums, zero at first.
+    pub sums: &'a mut [f32],
 }
 
 impl Kernel for MultiplyOutliers<'_> {
@@ -109,9 +107,6 @@ impl Kernel for MultiplyOutliers<'_> {
     fn run<S: Simd>(self, _: S) {
         let rows = self.outliers.iter().zip(self.sums.chunks_exact_mut(self.columns));
         for (outliers, sums) in rows.filter(|(outliers, _)| !outliers.is_empty()) {
-            sums.fill(MaybeUninit::new(0.0));
-            // SAFETY: they were written.
-            let sums = unsafe { sums.assume_init_mut() };
             for (input, value) in outliers.iter() {
                 let (run, word) = (self.run, input / 4);
                 let words = &self.panel[word / run * run * self.columns..][..run * self.columns];

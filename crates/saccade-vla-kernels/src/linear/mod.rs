@@ -14,20 +14,19 @@ mod schedule;
 use std::mem::MaybeUninit;
 use std::ops::Range;
 
-use crate::aligned::{AlignedBuffer, AllocError, elements};
+use crate::aligned::{AlignedBuffer, AllocError};
 use crate::cpu::Cpu;
 use crate::gemm::outliers::{MultiplyOutliers, Outliers};
-use crate::gemm::{Block, Gemm, MAX_NR, MAX_SUMS, Quantized, RowSplit};
+use crate::gemm::{Block, Gemm, MAX_SUMS, Quantized, RowSplit};
 use crate::isa::Isa;
 use crate::parts::part;
 use crate::pool::{parallel_for, usable};
-use crate::rows::{Rows, RowsMut};
+use crate::rows::{Rows, RowsMut, SharedRows};
 use crate::weights::{Arithmetic, Element, WeightRef};
 pub use epilogue::Epilogue;
 use epilogue::{Finish, Int8};
 pub use error::KernelError;
-use error::MAX_INT8_INPUTS;
-use pack::{Panels, pack_panels};
+use pack::{Panels, check_panel, pack_panels, packed_element};
 pub use rows::LinearScratch;
 use rows::RowConversion;
 use schedule::Schedule;
@@ -264,7 +263,7 @@ impl PackedLinear {
         threads: usize,
         x: Rows<'_>,
         epilogue: Epilogue,
-        mut out: RowsMut<'_>,
+        out: RowsMut<'_>,
         scratch: &mut LinearScratch,
     ) -> Result<(), AllocError> {
         let rows = x.num_rows();
@@ -295,7 +294,7 @@ impl PackedLinear {
         // 49 x 128 x 128 has three panels of 48 columns, which two threads would take in the time of two.
         let wanted = (TASKS_PER_THREAD * threads)
             .div_ceil(num_panels)
-            .min(macs / (num_panels * MACS_OF_TASK));
+            .min(macs / num_panels / MACS_OF_TASK);
         let most = split.count.min(if threads == 1 { 1 } else { wanted.max(1) });
         let blocks = rows.div_ceil(self.gemm.row_block(self.in_features)).max(most);
         let mut call = Call {
@@ -303,8 +302,7 @@ impl PackedLinear {
             split,
             quantized: &[],
             outliers: &[],
-            out_stride: out.row_stride(),
-            out: out.as_mut_ptr(),
+            out: SharedRows::new(out),
             epilogue,
         };
         if let Some(stride) = self.gemm.converted_stride(self.in_features) {
@@ -342,15 +340,11 @@ impl PackedLinear {
             split: call.split,
             calls,
             weights,
-            // The results are made in whole vectors.
-            needed: self
-                .panel_width(panel)
-                .next_multiple_of(self.isa.vectors().lanes)
-                .min(columns),
+            needed: self.needed_columns(panel),
             ahead,
             streams: self.streams,
-            out: call.out.wrapping_add(panel * columns),
-            out_stride: call.out_stride,
+            out: call.out.as_ptr().wrapping_add(panel * columns),
+            out_stride: call.out.row_stride(),
         };
         let mut sums = SumBuffer([const { MaybeUninit::uninit() }; MAX_SUMS]);
         self.gemm.multiply_and_finish(&block, &mut sums.0, &|rows, sums| {
@@ -363,6 +357,14 @@ impl PackedLinear {
     fn panel_width(&self, panel: usize) -> usize {
         let columns = self.gemm.shape().nr;
         columns.min(self.out_features - panel * columns)
+    }
+
+    /// Columns of panel number `panel` whose sums are needed: results are made in whole vectors.
+    fn needed_columns(&self, panel: usize) -> usize {
+        let width = self.panel_width(panel);
+        width
+            .next_multiple_of(self.isa.vectors().lanes)
+            .min(self.gemm.shape().nr)
     }
 
     /// Makes results of the complete sums of some rows and panel number `panel`, whose words are `weights`.
@@ -379,59 +381,38 @@ impl PackedLinear {
         let outliers = call.outliers.get(rows.clone()).unwrap_or_default();
         let has_outliers = outliers.iter().any(|outliers| !outliers.is_empty());
         let mut apart = [const { MaybeUninit::uninit() }; MAX_SUMS];
+        let apart = &mut apart[..if has_outliers { rows.len() * columns } else { 0 }];
+        apart.fill(MaybeUninit::new(0.0));
+        // SAFETY: all elements have just been written.
+        let apart = unsafe { apart.assume_init_mut() };
         if has_outliers {
             self.gemm.multiply_outliers(MultiplyOutliers {
                 outliers,
                 panel: weights,
                 columns,
                 run: 1,
-                sums: &mut apart[..rows.len() * columns],
+                sums: apart,
             });
         }
-        let columns_of = first..first + columns;
-        self.isa.run(&Finish {
-            epilogue: call.epilogue,
-            sums: sums.as_ptr().cast(),
-            columns,
-            rows,
-            width: self.panel_width(panel),
-            bias: &self.bias[columns_of.clone()],
-            int8: Int8 {
-                scales: self.panels.scales.get(columns_of.clone()).unwrap_or_default(),
-                sums: self.panels.sums.get(columns_of).unwrap_or_default(),
-                quantized: call.quantized,
-                outliers,
-                apart: has_outliers.then_some(&apart[..]),
-            },
-            out: call.out.wrapping_add(first),
-            out_stride: call.out_stride as isize,
+        let of_panel = first..first + columns;
+        let int8 = (self.element == Element::Int8).then(|| Int8 {
+            scales: &self.panels.scales[of_panel.clone()],
+            weight_sums: &self.panels.sums[of_panel.clone()],
+            quantized: &call.quantized[rows.clone()],
+            outliers: if has_outliers { outliers } else { &[] },
+            apart: Rows::new(apart, columns),
         });
-    }
-}
-
-/// Checks that memory can have a panel, and a converted row, of `in_features`: every [`Gemm`] multiplies and pads their sizes
-/// without checks.
-fn check_panel(in_features: usize) -> Result<(), AllocError> {
-    // More than any product pads a row to.
-    let padded = in_features.checked_next_multiple_of(1024);
-    let padded = padded.ok_or(AllocError { bytes: usize::MAX })?;
-    elements(padded, MAX_NR * size_of::<u32>()).map(drop)
-}
-
-/// The element that weights, which `are_bf16` or are not, are packed as.
-fn packed_element(
-    arithmetic: Arithmetic,
-    are_bf16: bool,
-    in_features: usize,
-) -> Result<Element, KernelError> {
-    match arithmetic {
-        Arithmetic::Float32 if are_bf16 => Ok(Element::Bf16),
-        Arithmetic::Float32 => Ok(Element::F32),
-        Arithmetic::Bfloat16 => Ok(Element::Bf16),
-        Arithmetic::Int8 if in_features > MAX_INT8_INPUTS => {
-            Err(KernelError::TooManyInputs { given: in_features })
-        }
-        Arithmetic::Int8 => Ok(Element::Int8),
+        // SAFETY: the product has written the sums of the needed columns of these rows.
+        let sums = unsafe { Rows::initialised(sums, rows.len(), self.needed_columns(panel), columns) };
+        // SAFETY: no two tasks have a row and a panel in common, and rows are finished once.
+        let out = unsafe { call.out.block(rows, first..first + self.panel_width(panel)) };
+        self.isa.run(&mut Finish {
+            epilogue: call.epilogue,
+            sums,
+            bias: &self.bias[of_panel],
+            int8,
+            out,
+        });
     }
 }
 
@@ -443,11 +424,6 @@ struct Call<'a> {
     quantized: &'a [Quantized],
     /// Of each row, if they are kept apart.
     outliers: &'a [Outliers],
-    /// Row 0 of the results, to which tasks write at the same time.
-    out: *mut f32,
-    out_stride: usize,
+    out: SharedRows<'a>,
     epilogue: Epilogue,
 }
-
-// SAFETY: tasks write disjoint parts of `out`, borrowed for the whole call: no two have a block of rows and a panel in common.
-unsafe impl Sync for Call<'_> {}

@@ -1,11 +1,11 @@
 //! From weights as they are stored to panels, on several threads.
 
-use super::error::KernelError;
-use crate::aligned::{AlignedBuffer, elements};
-use crate::gemm::{Gemm, PanelMut};
+use super::error::{KernelError, MAX_INT8_INPUTS};
+use crate::aligned::{AlignedBuffer, AllocError, elements};
+use crate::gemm::{Gemm, MAX_NR, PanelMut};
 use crate::pool::{Interrupted, is_stopped, parallel_for};
 use crate::rows::{RowsMut, SharedRows};
-use crate::weights::WeightRef;
+use crate::weights::{Arithmetic, Element, WeightRef};
 
 /// Packed weights.
 pub(super) struct Panels {
@@ -67,4 +67,30 @@ pub(super) fn pack_panels(
         return Err(Interrupted.into());
     }
     Ok(Panels { words, scales, sums })
+}
+
+/// Checks that memory can have a panel, and a converted row, of `in_features`: every [`Gemm`] multiplies and pads their sizes
+/// without checks.
+pub(super) fn check_panel(in_features: usize) -> Result<(), AllocError> {
+    // More than any product pads a row to.
+    let padded = in_features.checked_next_multiple_of(1024);
+    let padded = padded.ok_or(AllocError { bytes: usize::MAX })?;
+    elements(padded, MAX_NR * size_of::<u32>()).map(drop)
+}
+
+/// The element that weights, which `are_bf16` or are not, are packed as.
+pub(super) fn packed_element(
+    arithmetic: Arithmetic,
+    are_bf16: bool,
+    in_features: usize,
+) -> Result<Element, KernelError> {
+    match arithmetic {
+        Arithmetic::Float32 if are_bf16 => Ok(Element::Bf16),
+        Arithmetic::Float32 => Ok(Element::F32),
+        Arithmetic::Bfloat16 => Ok(Element::Bf16),
+        Arithmetic::Int8 if in_features > MAX_INT8_INPUTS => {
+            Err(KernelError::TooManyInputs { given: in_features })
+        }
+        Arithmetic::Int8 => Ok(Element::Int8),
+    }
 }

@@ -7,8 +7,8 @@ use crate::parts::{part, threads_and_tasks};
 use crate::pool::parallel_for;
 use crate::rows::{Rows, RowsMut, SharedRows};
 
-/// Memory for activations on their way through [`PackedLinear::apply`](super::PackedLinear::apply): one for all layers that are called one
-/// after the other. It grows to what the largest of them needs.
+/// Memory for activations on their way through [`PackedLinear::apply`](super::PackedLinear::apply): one for
+/// all layers that are called one after the other. It grows to what the largest of them needs.
 pub struct LinearScratch {
     words: AlignedBuffer<u32>,
     quantized: AlignedBuffer<Quantized>,

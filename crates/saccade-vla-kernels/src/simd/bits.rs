@@ -31,6 +31,12 @@ pub(crate) fn cast<From: Bits, To: Bits>(from: From) -> To {
     unsafe { std::mem::transmute_copy(&from) }
 }
 
+/// How many `T` a vector has.
+const fn elements_of<V, T>() -> usize {
+    assert!(size_of::<V>().is_multiple_of(size_of::<T>()));
+    size_of::<V>() / size_of::<T>()
+}
+
 /// A vector of the first elements of `from`.
 ///
 /// # Panics
@@ -38,7 +44,7 @@ pub(crate) fn cast<From: Bits, To: Bits>(from: From) -> To {
 #[inline(always)]
 #[track_caller]
 pub(crate) fn read<T: Bits, V: Bits>(from: &[T]) -> V {
-    let from = &from[..size_of::<V>() / size_of::<T>()];
+    let from = &from[..const { elements_of::<V, T>() }];
     // SAFETY: the slice has the size of the vector, and any bits are one. It may begin anywhere.
     unsafe { from.as_ptr().cast::<V>().read_unaligned() }
 }
@@ -50,7 +56,7 @@ pub(crate) fn read<T: Bits, V: Bits>(from: &[T]) -> V {
 #[inline(always)]
 #[track_caller]
 pub(crate) fn write_uninit<T: Bits, V: Bits>(vector: V, to: &mut [MaybeUninit<T>]) {
-    let to = &mut to[..size_of::<V>() / size_of::<T>()];
+    let to = &mut to[..const { elements_of::<V, T>() }];
     // SAFETY: the slice has the size of the vector, and any bits are elements of it. It may begin anywhere.
     unsafe { to.as_mut_ptr().cast::<V>().write_unaligned(vector) }
 }
@@ -62,21 +68,12 @@ pub(crate) fn write_uninit<T: Bits, V: Bits>(vector: V, to: &mut [MaybeUninit<T>
 #[inline(always)]
 #[track_caller]
 pub(crate) fn write<T: Bits, V: Bits>(vector: V, to: &mut [T]) {
-    let to = &mut to[..size_of::<V>() / size_of::<T>()];
+    let to = &mut to[..const { elements_of::<V, T>() }];
     // SAFETY: the slice has the size of the vector, and any bits are elements of it. It may begin anywhere.
     unsafe { to.as_mut_ptr().cast::<V>().write_unaligned(vector) }
 }
 
 /// The same memory as elements of another type, of which a whole number fits into each.
-#[inline(always)]
-pub(crate) fn cast_slice<From: Bits, To: Bits>(from: &[From]) -> &[To] {
-    const { assert!(size_of::<From>().is_multiple_of(size_of::<To>()) && align_of::<To>() <= align_of::<From>()) }
-    let len = from.len() * (size_of::<From>() / size_of::<To>());
-    // SAFETY: the memory has this size and alignment, and any bits are a `To`.
-    unsafe { std::slice::from_raw_parts(from.as_ptr().cast(), len) }
-}
-
-/// The same of memory to write.
 #[inline(always)]
 pub(crate) fn cast_slice_mut<From: Bits, To: Bits>(from: &mut [From]) -> &mut [To] {
     const { assert!(size_of::<From>().is_multiple_of(size_of::<To>()) && align_of::<To>() <= align_of::<From>()) }

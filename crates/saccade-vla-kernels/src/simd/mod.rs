@@ -8,13 +8,11 @@
 pub(crate) mod aarch64;
 pub(crate) mod bits;
 pub(crate) mod math;
-pub(crate) mod old;
 pub(crate) mod portable;
 #[cfg(target_arch = "x86_64")]
 pub(crate) mod x86_64;
 
 use bits::{Bits, cast, read, write};
-pub(crate) use old::{Dots, NoDots, Vector, load, store};
 
 /// Lanes of the widest vector.
 pub(crate) const MAX_LANES: usize = 16;
@@ -54,11 +52,6 @@ pub(crate) trait Simd: Copy + Send + Sync + 'static {
     type F32: Bits;
     /// `LANES` i32, or as many words of narrow elements.
     type I32: Bits;
-
-    /// As in [`old`].
-    type Vector: Vector;
-    /// As in [`old`].
-    type Dots: Dots<Self::Vector>;
 
     /// The proof that this CPU has the instruction set.
     fn new() -> Option<Self>;

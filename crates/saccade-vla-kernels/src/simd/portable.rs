@@ -45,8 +45,6 @@ impl<const N: usize> Simd for Loops<N> {
     const MAX_BYTE: u8 = 255;
     type F32 = [f32; N];
     type I32 = [i32; N];
-    type Vector = super::old::portable::Lanes<N>;
-    type Dots = super::NoDots;
 
     fn new() -> Option<Self> {
         Some(Self)

@@ -13,7 +13,7 @@ macro_rules! sums {
         /// The CPU has the instruction.
         #[inline(always)]
         pub(crate) unsafe fn $name(mut sum: $sum, a: $a, b: $b) -> $sum {
-            // SAFETY: the caller's promise; registers alone are read and written.
+            // SAFETY: the caller's CPU has the instruction, which reads and writes registers alone.
             unsafe {
                 asm!(
                     $template,
@@ -49,7 +49,7 @@ macro_rules! sums_by_lane {
         /// The CPU has the instruction.
         #[inline(always)]
         pub(crate) unsafe fn $name<const LANE: i32>(mut sum: $sum, a: $a, b: $b) -> $sum {
-            // SAFETY: the caller's promise; registers alone are read and written.
+            // SAFETY: the caller's CPU has the instruction, which reads and writes registers alone.
             unsafe {
                 asm!(
                     $template,
@@ -81,7 +81,7 @@ sums_by_lane! {
 #[inline(always)]
 pub(crate) unsafe fn bfcvtn(x: float32x4_t) -> uint16x4_t {
     let out;
-    // SAFETY: the caller's promise; registers alone are read and written.
+    // SAFETY: the caller's CPU has the instruction, which reads and writes registers alone.
     unsafe {
         asm!(
             "bfcvtn {0:v}.4h, {1:v}.4s",

@@ -32,7 +32,6 @@ macro_rules! neon {
                 const MAX_BYTE: u8 = 255;
                 type F32 = float32x4_t;
                 type I32 = int32x4_t;
-                type Vector = float32x4_t;
                 forward! {
                     fn fma_lane<const LANE: i32>(a: float32x4_t, b: float32x4_t, addend: float32x4_t) -> float32x4_t = fma_lane;
                     fn dot_int8(sum: int32x4_t, x: int32x4_t, w: int32x4_t) -> int32x4_t = dot_int8;
@@ -47,7 +46,6 @@ neon! {
     /// NEON, which every 64-bit ARM has.
     Neon: [], {
         forward! { fn to_bf16_pairs(first: float32x4_t, second: float32x4_t) -> int32x4_t = to_bf16_pairs; }
-        type Dots = crate::simd::NoDots;
     }
 }
 
@@ -56,7 +54,6 @@ neon! {
     /// lane.
     NeonDotprod: ["dotprod"], {
         forward! { fn to_bf16_pairs(first: float32x4_t, second: float32x4_t) -> int32x4_t = to_bf16_pairs; }
-        type Dots = crate::simd::old::neon::Dotprod;
         const DOT_NAME: &'static str = "dotprod";
     }
 }
@@ -66,7 +63,6 @@ neon! {
     /// by two columns.
     NeonI8mm: ["i8mm"], {
         forward! { fn to_bf16_pairs(first: float32x4_t, second: float32x4_t) -> int32x4_t = to_bf16_pairs; }
-        type Dots = crate::simd::old::neon::I8mm;
         const DOT_NAME: &'static str = "i8mm";
     }
 }
@@ -74,7 +70,6 @@ neon! {
 neon! {
     /// NEON with products of bfloat16.
     NeonBf16: ["bf16"], {
-        type Dots = crate::simd::old::neon::Bf16;
         const HAS_DOT_BF16: bool = true;
         const DOT_NAME: &'static str = "bf16";
         forward! {

@@ -18,7 +18,6 @@ macro_rules! avx2 {
                 const TILE_VECTORS: usize = 2;
                 type F32 = __m256;
                 type I32 = __m256i;
-                type Vector = __m256;
                 forward! { fn to_bf16_pairs(first: __m256, second: __m256) -> __m256i = to_bf16_pairs; }
                 $($own)*
             }
@@ -29,7 +28,6 @@ macro_rules! avx2 {
 avx2! {
     /// AVX2 with FMA.
     Avx2: [], {
-        type Dots = crate::simd::NoDots;
         // Two products of at most 129 * 127 are less than 2^15, where `maddubs` saturates. The other ways out
         // cost more: 7 bits in the weights lose as much (0.018 of the result instead of 0.011; this way,
         // 0.017), 16-bit products take the time of float32.
@@ -41,7 +39,6 @@ avx2! {
 avx2! {
     /// AVX2 with AVX-VNNI: the shorter encoding, of CPUs that may lack AVX-512.
     Avx2VexVnni: ["avxvnni"], {
-        type Dots = crate::simd::old::avx2::VexVnni;
         const MAX_BYTE: u8 = 255;
         const DOT_NAME: &'static str = "vnni";
         forward! { fn dot_int8(sum: __m256i, x: __m256i, w: __m256i) -> __m256i = _mm256_dpbusd_avx_epi32; }
@@ -51,7 +48,6 @@ avx2! {
 avx2! {
     /// AVX2 with the 256-bit form of AVX512-VNNI.
     Avx2EvexVnni: ["avx512f", "avx512vl", "avx512vnni"], {
-        type Dots = crate::simd::old::avx2::EvexVnni;
         const MAX_BYTE: u8 = 255;
         const DOT_NAME: &'static str = "vnni";
         forward! { fn dot_int8(sum: __m256i, x: __m256i, w: __m256i) -> __m256i = _mm256_dpbusd_epi32; }

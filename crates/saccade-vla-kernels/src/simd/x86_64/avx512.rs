@@ -22,7 +22,6 @@ macro_rules! avx512 {
                 const TILE_VECTORS: usize = 3;
                 type F32 = __m512;
                 type I32 = __m512i;
-                type Vector = __m512;
                 forward! { fn transpose(square: &[[u32; MAX_LANES]; MAX_LANES], to: &mut [u32]) = transpose; }
                 $($own)*
             }
@@ -33,7 +32,6 @@ macro_rules! avx512 {
 avx512! {
     /// AVX-512 F, VL, BW and DQ.
     Avx512: [], {
-        type Dots = crate::simd::NoDots;
         // As with AVX2.
         const MAX_BYTE: u8 = 129;
         forward! {
@@ -46,7 +44,6 @@ avx512! {
 avx512! {
     /// AVX-512 with VNNI.
     Avx512Vnni: ["avx512vnni"], {
-        type Dots = crate::simd::old::avx512::Vnni;
         const MAX_BYTE: u8 = 255;
         const DOT_NAME: &'static str = "vnni";
         forward! {
@@ -60,7 +57,6 @@ avx512! {
     /// AVX-512 with BF16, where its products are faster than those of float32: on Intel's Sapphire Rapids
     /// they have half the rate.
     Avx512Bf16: ["avx512bf16"] if Cpu::current().has_fast_bf16_dot(), {
-        type Dots = crate::simd::old::avx512::Bf16;
         const MAX_BYTE: u8 = 129;
         const HAS_DOT_BF16: bool = true;
         const DOT_NAME: &'static str = "bf16";
@@ -76,7 +72,6 @@ avx512! {
     /// AVX-512 with what works beside the tiles of AMX: VNNI, and BF16 for conversions alone, because
     /// products of bfloat16 are those of tiles.
     Avx512Amx: ["avx512bf16", "avx512vnni"], {
-        type Dots = crate::simd::old::avx512::BesideTiles;
         const MAX_BYTE: u8 = 255;
         const DOT_NAME: &'static str = "bf16";
         forward! {
