@@ -127,7 +127,8 @@ def test_json_has_times_and_profile(capsys: pytest.CaptureFixture[str], folder: 
     assert report["machine"]["num_threads"] == 1
     assert set(report["machine"]["kernels"]) == set(PRECISIONS)
     kernels = {part["part"]: part["kernel"] for one in report["profile"] for part in one["parts"]}
-    assert kernels["to_q"] == report["machine"]["kernels"]["float32"]
+    # The weights are bfloat16, and widened in registers.
+    assert kernels["to_q"] == report["machine"]["kernels"]["float32"] + "-bf16"
     assert kernels["attention"] == ""
     assert set(report["machine"]["macs_per_second"]) == set(PRECISIONS)
     works = {one["call"]: sum(part["multiply_adds"] for part in one["parts"]) for one in report["profile"]}
