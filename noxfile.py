@@ -239,7 +239,8 @@ def format(session: nox.Session) -> None:
 def package(session: nox.Session) -> None:
     """Pack the library crates as for publication, and build what they pack."""
     needs(session, "rust")
-    cargo(session, "package", "--workspace", "--locked", *session.posargs)
+    others = ("--exclude", "saccade-python", "--exclude", "saccade-benches")
+    cargo(session, "package", "--workspace", *others, "--locked", *session.posargs)
 
 
 @nox.session

@@ -6,8 +6,8 @@ use std::path::{Path, PathBuf};
 use std::sync::LazyLock;
 
 use saccade_vla::{
-    Array, Frame, HeadConfig, Observation, Preprocessing, Processor, ProcessorOptions, ProcessorSource,
-    Published, ResizeOptions, RewriteOptions, Tokenizer, TokenizerFiles, resize, resized_config,
+    Array, Frame, HeadCheckpoint, HeadConfig, Observation, Preprocessing, Processor, ProcessorOptions,
+    ProcessorSource, ResizeOptions, RewriteOptions, Tokenizer, TokenizerFiles, resize, resized_config,
     tensor_shapes,
 };
 use saccade_vla_checkpoint::spec::TensorSpec;
@@ -96,7 +96,7 @@ fn use_head_config(config: &HeadConfig) {
 /// promises, up to some gigabytes, which take no memory as long as nobody reads them.
 pub fn use_published(folder: &Path, config: &str, header: &[u8]) {
     write_checkpoint(folder, config, header, b"", 1 << 33);
-    let published = match Published::open(folder, None) {
+    let published = match HeadCheckpoint::open(folder, None) {
         Ok(published) => published,
         Err(error) => return check_message(&error),
     };
@@ -129,7 +129,7 @@ pub fn use_resize(folder: &Path, count: usize, config: &str, header: &[u8], byte
     match resize(&source, &out, &options, |_, _| true) {
         Ok(report) => {
             assert_eq!((report.num_after, report.sources.len()), (count, count));
-            let published = Published::open(&out, None).expect("what was written can be read");
+            let published = HeadCheckpoint::open(&out, None).expect("what was written can be read");
             published.check().expect("what was written fits");
             assert_eq!(published.config.num_future_tokens, count);
             assert_eq!(published.config.future_key_bias, report.future_key_bias);
