@@ -24,6 +24,7 @@ class Standardizer:
         scale: ``(features,)``: the deviation, 1 for a constant column, and 1 everywhere without ``scaled``.
 
     Example:
+        >>> import numpy as np
         >>> x = np.array([[1.0, 5.0], [3.0, 5.0]])
         >>> Standardizer(x).transform(x)
         array([[-1.,  0.],
@@ -53,6 +54,7 @@ class PCA:
         total_variance: The sum of the variances of all columns.
 
     Example:
+        >>> import numpy as np
         >>> pca = PCA(np.outer([0.0, 1.0, 2.0], [3.0, 4.0]), components=1)
         >>> pca.components.round(3), round(pca.total_variance, 3)
         (array([[0.6, 0.8]]), 25.0)
@@ -104,6 +106,7 @@ def linear_cka(x: ArrayLike, y: ArrayLike) -> float:
     2019, "Similarity of Neural Network Representations Revisited"). An InputError says that nothing varies.
 
     Example:
+        >>> import numpy as np
         >>> x = np.random.default_rng(0).standard_normal((20, 3))
         >>> round(linear_cka(x, 2.0 * x[:, ::-1] + 1.0), 6)
         1.0
@@ -118,6 +121,7 @@ def principal_angles(a: ArrayLike, b: ArrayLike) -> Float64Array:
     are as many angles as the smaller rank. Arguments are ``(dimensions, vectors)``, not all zero.
 
     Example:
+        >>> import numpy as np
         >>> np.degrees(principal_angles([[1], [0]], [[1], [1]])).round(9)
         array([45.])
     """

@@ -1,4 +1,6 @@
 //! The exponential and the activations of slices, in place.
+//!
+//! Equations 33 and 34 of docs/equations.md.
 
 use std::marker::PhantomData;
 

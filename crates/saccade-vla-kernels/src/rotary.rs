@@ -1,5 +1,7 @@
 //! Rotary position embedding, with the two halves of a head as the parts of the complex numbers that are
 //! rotated.
+//!
+//! Equation 24 of docs/equations.md.
 
 use crate::isa::Isa;
 use crate::parts::parallel_rows;

@@ -1,4 +1,6 @@
 //! Weights as they are stored, the arithmetic that multiplies them, and their quantisation to int8.
+//!
+//! Equation 37 of docs/equations.md.
 
 use std::ops::Range;
 

@@ -13,7 +13,8 @@
 //!   `rewrite`) write changed copies. Files are read by [`files`].
 //!
 //! Everything that is loaded is immutable and serves any number of threads at once. An [`Error`] names the argument, what was expected and
-//! what was given. [`Precision`] says what each kind of layer computes in.
+//! what was given. [`Precision`] says what each kind of layer computes in. Comments cite the equations of docs/equations.md in the
+//! repository, which names the function that computes each.
 
 #![forbid(unsafe_code)]
 

@@ -1,4 +1,6 @@
 //! The stable softmax of one query over blocks of keys, with a running maximum and sum.
+//!
+//! Equation 41 of docs/equations.md.
 
 use super::arithmetic::TileArithmetic;
 use super::mask::Mask;

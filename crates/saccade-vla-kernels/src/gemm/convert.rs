@@ -1,4 +1,6 @@
 //! Rows converted to the elements that are multiplied: rounded to bfloat16, or quantised to bytes.
+//!
+//! Equations 36 and 38 of docs/equations.md.
 
 use std::marker::PhantomData;
 

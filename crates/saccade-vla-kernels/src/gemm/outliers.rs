@@ -2,6 +2,8 @@
 //!
 //! Models have a few channels a hundred times as large as the rest. A row that is quantised over the range of all of its
 //! elements has few steps left for the others. Which elements are kept apart depends on their row alone.
+//!
+//! Equation 39 of docs/equations.md.
 
 use crate::aligned::Zeroable;
 use crate::simd::{Kernel, Simd};

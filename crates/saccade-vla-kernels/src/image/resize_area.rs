@@ -1,4 +1,6 @@
 //! OpenCV's INTER_AREA of bytes.
+//!
+//! Equation 45 of docs/equations.md.
 
 use super::taps::Taps;
 use super::{CHANNELS, Image, Sums, TOGETHER, along_height, along_width, area, blank, padded, reserved};

@@ -1,4 +1,6 @@
 //! Linear, antialiased resizing in float32, as torch 2.9 for x86-64 does it.
+//!
+//! Equation 44 of docs/equations.md.
 
 use super::taps::Taps;
 use super::{Image, Sums, TOGETHER, along_height, along_width, blank, padded, reserved};

@@ -1,4 +1,6 @@
 //! Cubic and linear resizing of bytes in whole numbers, antialiased: torch's and Pillow's.
+//!
+//! Equations 42 and 43 of docs/equations.md.
 
 use super::taps::Taps;
 use super::{Image, Sums, TOGETHER, along_height, along_width};

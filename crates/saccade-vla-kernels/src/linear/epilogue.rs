@@ -1,5 +1,7 @@
 //! Epilogues: from the sums of a block to results, by dequantisation, outliers, bias, activation, and what is
 //! done with what `out` holds.
+//!
+//! Equations 35 and 40 of docs/equations.md.
 
 use std::marker::PhantomData;
 

@@ -1,4 +1,6 @@
 //! LayerNorm over rows, plain or with a scale and a shift applied in the same pass.
+//!
+//! Equation 32 of docs/equations.md.
 
 use crate::isa::Isa;
 use crate::parts::parallel_rows;

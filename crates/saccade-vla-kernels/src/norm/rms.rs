@@ -1,4 +1,6 @@
 //! RMSNorm over rows, or over each head of a row.
+//!
+//! Equation 27 of docs/equations.md.
 
 use crate::isa::Isa;
 use crate::parts::parallel_rows;

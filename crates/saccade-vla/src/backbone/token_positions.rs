@@ -1,4 +1,6 @@
 //! Positions of the tokens of a prompt, and the axes that rotary positions turn with.
+//!
+//! Equation 26 of docs/equations.md.
 
 use super::config::BackboneConfig;
 use super::inputs::{Prompt, ViewPixels};

@@ -25,7 +25,7 @@ pub struct HeadConfig {
     /// Whether every second block is self-attention; otherwise all are cross-attention.
     pub interleave_self_attention: bool,
     /// If n is not 0, cross-attention blocks see attended positions only: every n-th block, starting with the first, sees text, the others
-    /// images (spec 5.3). 0: all blocks see all positions, whatever the masks (spec 1.9).
+    /// images (equation 12 of docs/equations.md). 0: all blocks see all positions, whatever the masks.
     pub attend_text_every_n_blocks: usize,
     /// Whether the vision-language tokens pass the norm `vlln`.
     pub use_vlln: bool,
@@ -38,7 +38,7 @@ pub struct HeadConfig {
     /// Learned query rows between state and actions (`num_target_vision_tokens`).
     pub num_future_tokens: usize,
     /// What is added to the logits of each future key in every self-attention block: the logarithm of the number of tokens that it
-    /// represents (spec I2). Only saccade reads it.
+    /// represents (equation 47 of docs/equations.md). Only saccade reads it.
     pub future_key_bias: Option<Vec<f32>>,
     /// Actions in a chunk.
     pub action_horizon: usize,

@@ -220,7 +220,7 @@ impl Reader {
         ]
     }
 
-    /// The width of an action as it is denoised, and the decoders (spec 1.11).
+    /// The width of an action as it is denoised, and the decoders (equation 13 of docs/equations.md).
     fn actions(&mut self, version: Version, head: &Object) -> (usize, Vec<(String, usize)>) {
         let one = |width| vec![("action_decoder".to_owned(), width)];
         if version.is_flat() {

@@ -1,5 +1,7 @@
 //! Action rows from noisy actions and the timestep: `W3 silu(W2 [W1 x; tau]) + position` with the first two
 //! layers merged.
+//!
+//! Equations 4 and 5 of docs/equations.md.
 
 use std::sync::Arc;
 

@@ -1,5 +1,7 @@
 //! The diffusion transformer: one forward pass over the rows `[state, future, action]` (flow matching,
 //! docs/equations.md).
+//!
+//! Equations 7, 10, 11 and 13 of docs/equations.md.
 
 use std::sync::Arc;
 

@@ -1,5 +1,7 @@
 //! Layers with separate weights for each embodiment (`CategorySpecificLinear` and `CategorySpecificMLP` of
 //! the released code).
+//!
+//! Equation 1 of docs/equations.md.
 
 use saccade_vla_kernels::{Epilogue, Rows, RowsMut};
 

@@ -1,5 +1,7 @@
 //! Flow matching: the velocity of noisy actions, and its integration from noise to actions, in the order in
 //! which it is computed.
+//!
+//! Equations 2, 6, 13 and 15 of docs/equations.md.
 
 use std::sync::Arc;
 

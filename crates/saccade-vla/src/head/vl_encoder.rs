@@ -1,5 +1,7 @@
 //! The vision-language tokens: `vlln`, the VL self-attention, and the KV caches of the cross-attention
 //! blocks.
+//!
+//! Equation 8 of docs/equations.md.
 
 use std::ops::Range;
 

@@ -1,5 +1,7 @@
 //! Multi-head attention with its projections: what the blocks of the head and the stand-alone cross-attention
 //! share.
+//!
+//! Equation 9 of docs/equations.md.
 
 use saccade_vla_kernels::{Epilogue, LogitBias, PackedKeyValues, Rows, RowsMut};
 

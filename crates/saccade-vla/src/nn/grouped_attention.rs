@@ -1,5 +1,7 @@
 //! Self-attention of language and vision models: heads of queries that share heads of keys, norms of both,
 //! rotary positions, a causal mask.
+//!
+//! Equation 28 of docs/equations.md.
 
 use std::ops::Range;
 

@@ -1,4 +1,6 @@
 //! Rotary position embedding (RoPE): the angles of positions.
+//!
+//! Equation 25 of docs/equations.md.
 
 use saccade_vla_kernels::{Rows, RowsMut};
 

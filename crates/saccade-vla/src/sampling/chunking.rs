@@ -1,4 +1,4 @@
-//! Real-time chunking (spec 5.2): a chunk begins with the end of the previous one.
+//! Real-time chunking (equation 17 of docs/equations.md): a chunk begins with the end of the previous one.
 
 use saccade_vla_kernels::{Rows, RowsMut};
 

@@ -1,4 +1,6 @@
 //! The integration of the velocity, from noise at flow time 0 to actions at flow time 1.
+//!
+//! Equations 15 and 16 of docs/equations.md.
 
 use saccade_vla_kernels::{Rows, RowsMut};
 

@@ -1,4 +1,6 @@
 //! The timestep of a flow time.
+//!
+//! Equation 14 of docs/equations.md.
 
 /// The timestep of evaluation number `index` of `count` at equal flow times: `floor(index / count * num_timesteps)`
 /// in float64, as the released sampler does.

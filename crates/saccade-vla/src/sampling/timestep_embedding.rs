@@ -4,6 +4,8 @@
 //! float32 `exp`, `sin` and `cos` of whatever vector library its torch was built with; one ulp of a frequency moves an
 //! angle of 900 rad by 6e-5. Here exponents and angles are float32 as there, and the functions are evaluated in float64
 //! and rounded once.
+//!
+//! Equations 3 and 7 of docs/equations.md.
 
 /// ln 10000, rounded to float32 as the released code does.
 const LN_10000: f32 = 9.210_340_5;

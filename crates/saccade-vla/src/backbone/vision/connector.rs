@@ -1,5 +1,7 @@
 //! The connector between vision tower and language model: squares of patches are joined, normed, and
 //! projected to the width of the language model.
+//!
+//! Equations 22 and 23 of docs/equations.md.
 
 use saccade_vla_kernels::{Epilogue, Rows, RowsMut};
 

@@ -1,4 +1,6 @@
 //! Positions of patches: tables resized to a grid, and the axes that rotary positions turn with.
+//!
+//! Equation 20 of docs/equations.md.
 
 use saccade_vla_kernels::Rows;
 

@@ -1,8 +1,9 @@
 //! Checkpoints with another number of future tokens.
 //!
-//! A token can be replaced by n copies if log(n) is subtracted from the logits of their keys in every self-attention block, and n equal tokens
-//! by one if log(n) is added (spec I2). No published layout has a place for such a bias, so it is written under a key of saccade's own: the
-//! result is exact in saccade, while other programs see plain copies.
+//! A token can be replaced by n copies if log(n) is subtracted from the logits of their keys in every
+//! self-attention block, and n equal tokens by one if log(n) is added (equation 47 of docs/equations.md). No
+//! published layout has a place for such a bias, so it is written under a key of saccade's own: the result is
+//! exact in saccade, while other programs see plain copies.
 
 mod config_edit;
 mod merge;
