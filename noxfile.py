@@ -333,34 +333,16 @@ def succeeds(*command: str) -> bool:
     return found and subprocess.run(command, capture_output=True, check=False).returncode == 0
 
 
-# Tests that take too long in valgrind's emulation are left out; `narrow` takes a minute and a half.
-VALGRIND_TESTS = "attention layer_norm linear masks narrow narrow_weights outliers rms_norm rotary_embedding"
-# AddressSanitizer reports running out of memory as an error. Under it a test may run for more than a minute;
-# the test runner then prints a warning, which allocates, so the test that counts allocations is skipped too.
-ASAN_SKIPPED = "allocates_nothing without_memory cannot_be_had cannot_be_started"
+@nox.session
+def sanitize(session: nox.Session) -> None:
+    """Run the kernel tests under AddressSanitizer (nightly Rust) and valgrind."""
+    session.run(str(ROOT / ".ci/sanitize.sh"), *session.posargs, external=True)
 
 
 @nox.session
-def sanitize(session: nox.Session) -> None:
-    """Run the kernel tests under AddressSanitizer (nightly Rust) and valgrind.
-
-    They are of the only crate with unsafe code. AddressSanitizer runs on every instruction set of this CPU,
-    in a target folder of its own, because dependencies are instrumented too. Valgrind emulates a CPU without
-    AVX-512, so it covers the portable and AVX2 paths, and tiles in software where a test has them. It is
-    slow, so the tests that compare many sizes with float64 are skipped.
-    """
-    if not succeeds("cargo", "+nightly", "--version"):
-        session.error("needs a nightly Rust: rustup toolchain install nightly")
-    if shutil.which("valgrind") is None:
-        session.error("valgrind is not installed; install the package valgrind")
-    kernels = ("test", "--locked", "--quiet", "--package", "saccade-vla-kernels")
-    skipped = [word for name in ASAN_SKIPPED.split() for word in ("--skip", name)]
-    target = ("--target", "x86_64-unknown-linux-gnu", "--target-dir", "target/sanitize")
-    options = ("--lib", "--tests", *target, "--", *skipped)
-    cargo(session, "+nightly", *kernels, *options, RUSTFLAGS="-Zsanitizer=address")
-    tests = [word for name in VALGRIND_TESTS.split() for word in ("--test", name)]
-    runner = {"CARGO_TARGET_X86_64_UNKNOWN_LINUX_GNU_RUNNER": "valgrind --quiet --error-exitcode=1"}
-    cargo(session, *kernels, *tests, "--", "--test-threads", "1", "--skip", "float64", **runner)
+def loom(session: nox.Session) -> None:
+    """Run the models of the thread pool in every order of threads, up to some preemptions."""
+    cargo(session, "test", "--locked", "--quiet", "--manifest-path", "loom/Cargo.toml")
 
 
 @nox.session
@@ -418,9 +400,8 @@ def demo_policy(session: nox.Session) -> None:
     saccade("demos", "--out", demos, "--tasks", "window-open", "--episodes", "200")
     again = ("--start-from", first, "--training-steps", "4000", "--learning-rate", "3e-4", "--seed", "1")
     saccade("train", "--demos", demos, *again, "--out", policy)
-    saccade(
-        "rollout", "--checkpoint", policy, "--episodes", "20", "--seed", "1000", "--out", str(out / "check")
-    )
+    check = ("--episodes", "20", "--seed", "1000", "--out", str(out / "check"))
+    saccade("rollout", "--checkpoint", policy, *check)
 
 
 @nox.session

@@ -56,7 +56,7 @@ pub use matrix::Matrix;
 pub use norm::layer::layer_norm;
 pub use norm::rms::{rms_norm, rms_norm_in_place};
 pub use pool::{
-    Interrupted, StayOnThisThread, interrupted, interruptible, parallel_for, stay_on_this_thread,
+    Interrupted, MAX_THREADS, StayOnThisThread, interrupted, interruptible, parallel_for, stay_on_this_thread,
 };
 pub use rotary::rotary_embedding;
 pub use rows::{Rows, RowsMut};

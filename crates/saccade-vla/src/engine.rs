@@ -2,14 +2,10 @@
 
 use std::sync::atomic::{AtomicU64, Ordering};
 
-use saccade_vla_kernels::{Isa, LinearScratch};
+use saccade_vla_kernels::{Isa, LinearScratch, MAX_THREADS};
 
 use crate::error::{Error, Result, problem};
 use crate::precision::Precision;
-
-/// The most threads that can be asked for: far more than any machine has cores, far fewer than make starting
-/// them a problem.
-const MAX_THREADS: usize = 1024;
 
 /// The instruction set, threads and precision that a model computes with.
 #[derive(Clone, Copy, Debug)]

@@ -1,8 +1,9 @@
 //! Interruption: a caller's question whether to go on, asked between tasks, and the flag that stops the loops of that caller.
 
 use std::cell::Cell;
-use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
+
+use super::sync::{AtomicBool, Ordering};
 
 /// A caller is asked at most this often: the question may take a lock of an interpreter.
 const EVERY: Duration = Duration::from_millis(20);
@@ -13,25 +14,24 @@ const EVERY: Duration = Duration::from_millis(20);
 pub struct Interrupted;
 
 /// One call of [`interruptible`], on the caller's stack.
-pub(super) struct Scope {
-    poll: *const dyn Fn() -> bool,
+pub(super) struct Scope<'a> {
+    poll: &'a dyn Fn() -> bool,
     asked: Cell<Instant>,
     stop: AtomicBool,
-    /// The scope that this one is in; null if there is none.
-    outer: *const Scope,
+    /// The scope that this one is in.
+    outer: Option<&'a Scope<'a>>,
 }
 
 thread_local! {
-    /// The innermost scope of this thread; null if there is none.
-    static SCOPE: Cell<*const Scope> = const { Cell::new(std::ptr::null()) };
+    /// The innermost scope of this thread. It does not live as long as its type says: it is used through
+    /// [`Scope::with_current`] only.
+    static SCOPE: Cell<Option<&'static Scope<'static>>> = const { Cell::new(None) };
 }
 
-impl Scope {
-    /// The innermost scope of this thread.
-    pub(super) fn current<'a>() -> Option<&'a Self> {
-        // SAFETY: null, or a scope in a frame of this thread's stack that has not returned: leaving it resets the pointer, also on panic.
-        // No function keeps the reference for longer than a call within that frame.
-        unsafe { SCOPE.get().as_ref() }
+impl Scope<'_> {
+    /// Calls `f` with the innermost scope of this thread, which lives as long as the call.
+    pub(super) fn with_current<R>(f: impl FnOnce(Option<&Scope<'_>>) -> R) -> R {
+        f(SCOPE.get())
     }
 
     /// Whether loops are to stop. Asks the caller if it was not asked lately.
@@ -39,15 +39,13 @@ impl Scope {
         if self.stop.load(Ordering::Relaxed) {
             return true;
         }
-        // SAFETY: an outer scope outlives the scopes within it.
-        let outer = unsafe { self.outer.as_ref() }.is_some_and(Self::asks_to_stop);
+        let outer = self.outer.is_some_and(Scope::asks_to_stop);
         if !outer && self.asked.get().elapsed() < EVERY {
             return false;
         }
         // Before the question as well as after it: the answer may need loops of its own, and may take long.
         self.asked.set(Instant::now());
-        // SAFETY: the function outlives its scope.
-        let stop = outer || unsafe { (*self.poll)() };
+        let stop = outer || (self.poll)();
         self.asked.set(Instant::now());
         if stop {
             self.stop.store(true, Ordering::Relaxed);
@@ -55,7 +53,7 @@ impl Scope {
         stop
     }
 
-    /// What workers look at.
+    /// Set once loops are to stop; workers look at it.
     pub(super) fn flag(&self) -> &AtomicBool {
         &self.stop
     }
@@ -63,7 +61,7 @@ impl Scope {
 
 /// Whether loops of this thread have been stopped, so that some of their tasks may not have run. Asks nobody.
 pub(crate) fn is_stopped() -> bool {
-    Scope::current().is_some_and(|scope| scope.stop.load(Ordering::Relaxed))
+    Scope::with_current(|scope| scope.is_some_and(|scope| scope.stop.load(Ordering::Relaxed)))
 }
 
 /// Runs `work` on this thread, and asks `poll` every 20 ms or so whether to stop it.
@@ -85,7 +83,7 @@ pub(crate) fn is_stopped() -> bool {
 /// ```
 pub fn interruptible<R>(poll: &dyn Fn() -> bool, work: impl FnOnce() -> R) -> Result<R, Interrupted> {
     /// Makes the outer scope the innermost one again.
-    struct Leave(*const Scope);
+    struct Leave(Option<&'static Scope<'static>>);
 
     impl Drop for Leave {
         fn drop(&mut self) {
@@ -94,16 +92,17 @@ pub fn interruptible<R>(poll: &dyn Fn() -> bool, work: impl FnOnce() -> R) -> Re
     }
 
     let outer = SCOPE.get();
-    // SAFETY: only the lifetime changes. The pointer is used through the scope, which ends in this function.
-    let poll: *const (dyn Fn() -> bool + 'static) = unsafe { std::mem::transmute(poll) };
     let scope = Scope {
         poll,
         asked: Cell::new(Instant::now()),
         stop: AtomicBool::new(false),
         outer,
     };
+    // SAFETY: only lifetimes change. The reference is used by calls within `work` alone: `leave` takes it away when that
+    // ends, also by a panic, and before the scope does.
+    let current = unsafe { std::mem::transmute::<&Scope<'_>, &'static Scope<'static>>(&scope) };
     let leave = Leave(outer);
-    SCOPE.set(&raw const scope);
+    SCOPE.set(Some(current));
     let result = work();
     drop(leave);
     if scope.stop.load(Ordering::Relaxed) {
@@ -116,5 +115,5 @@ pub fn interruptible<R>(poll: &dyn Fn() -> bool, work: impl FnOnce() -> R) -> Re
 /// Whether an [`interruptible`] call that this code runs in is to stop: for code between two loops. Asks as they do.
 #[must_use]
 pub fn interrupted() -> bool {
-    Scope::current().is_some_and(Scope::asks_to_stop)
+    Scope::with_current(|scope| scope.is_some_and(Scope::asks_to_stop))
 }

@@ -12,189 +12,29 @@
 //! yields.
 
 mod interrupt;
+#[cfg(all(test, loom))]
+mod models;
 mod place;
 mod slot;
+mod sync;
+mod workers;
 
 use std::cell::Cell;
-use std::hint::black_box;
 use std::marker::PhantomData;
 use std::panic::resume_unwind;
-use std::sync::atomic::{AtomicPtr, AtomicU32, AtomicUsize, Ordering};
-use std::sync::{Condvar, Mutex, PoisonError};
-use std::time::{Duration, Instant};
+use std::ptr::null_mut;
+use std::sync::atomic::{AtomicPtr, Ordering};
 
 pub(crate) use interrupt::is_stopped;
 pub use interrupt::{Interrupted, interrupted, interruptible};
+#[cfg(feature = "peak")]
+pub(crate) use workers::has_room_for_thread;
 
 use interrupt::Scope;
-use place::Place;
-use slot::{Job, Slot, lock, spin_until};
-
-/// Calls that can have workers at the same time. A call beyond them runs on its own thread only.
-const SLOTS: usize = 8;
-
-/// How long a worker without work spins before it sleeps: about the longest pause between two loops of one forward pass.
-/// Waking a sleeping thread costs some 5 us of the caller's time, and as much again until it runs.
-const SPIN: Duration = Duration::from_micros(50);
-
-/// The longest time that a caller spins for workers that are inside: a few hundredths of a scheduler's time slice.
-const LONGEST_WAIT: Duration = Duration::from_micros(500);
+use workers::Workers;
 
 /// The most threads that a call can have: a guard against absurd requests.
-const MAX_THREADS: usize = 1024;
-
-/// Address space that must be free before a thread is started: more than the allocator keeps of what was freed before.
-const THREAD_ROOM: usize = 80 << 20;
-
-/// Whether a thread can be started. If the system grants a stack and little more, the standard library aborts the process when the thread
-/// begins.
-pub(crate) fn has_room_for_thread() -> bool {
-    let mut memory = Vec::<u8>::new();
-    let is_granted = memory.try_reserve_exact(THREAD_ROOM).is_ok();
-    // A compiler may leave out memory that is not used, and then takes it for granted.
-    black_box(&memory);
-    is_granted
-}
-
-struct Pool {
-    /// Where its workers live. A child of `fork` has this memory but not the threads.
-    process: u32,
-    /// Workers started.
-    workers: AtomicUsize,
-    slots: [Slot; SLOTS],
-    /// Grows with every job offered, so that a worker about to sleep sees that it should look again.
-    offers: AtomicU32,
-    sleepers: AtomicUsize,
-    bed: Mutex<()>,
-    wake: Condvar,
-}
-
-impl Pool {
-    const fn new(process: u32) -> Self {
-        Self {
-            process,
-            workers: AtomicUsize::new(0),
-            slots: [const { Slot::new() }; SLOTS],
-            offers: AtomicU32::new(0),
-            sleepers: AtomicUsize::new(0),
-            bed: Mutex::new(()),
-            wake: Condvar::new(),
-        }
-    }
-
-    /// Starts workers until there are `wanted`, or the system refuses one.
-    fn start_workers(&'static self, wanted: usize) {
-        while self.workers.load(Ordering::Relaxed) < wanted {
-            let take = |count: usize| (count < wanted).then_some(count + 1);
-            let Ok(index) = self
-                .workers
-                .fetch_update(Ordering::Relaxed, Ordering::Relaxed, take)
-            else {
-                return;
-            };
-            let thread = std::thread::Builder::new().name(format!("saccade-{}", index + 1));
-            if !has_room_for_thread() || thread.spawn(|| self.work()).is_err() {
-                // The call uses the threads that there are; a later call tries again.
-                self.workers.fetch_sub(1, Ordering::Relaxed);
-                return;
-            }
-        }
-    }
-
-    /// What a worker does, for as long as the process runs.
-    fn work(&self) -> ! {
-        INSIDE.set(true);
-        let mut place = Place::new();
-        loop {
-            let seen = self.offers.load(Ordering::SeqCst);
-            if self.help(&mut place) {
-                continue;
-            }
-            let idle_since = Instant::now();
-            let is_asked = || self.offers.load(Ordering::Relaxed) != seen;
-            while !spin_until(is_asked) && idle_since.elapsed() < SPIN {}
-            if self.offers.load(Ordering::SeqCst) == seen {
-                self.sleep(seen);
-            }
-        }
-    }
-
-    fn help(&self, place: &mut Place) -> bool {
-        let mut helped = false;
-        // Not `any`, which stops at the first: a worker visits all slots before it looks for new offers.
-        for slot in &self.slots {
-            helped |= slot.help(place);
-        }
-        helped
-    }
-
-    fn sleep(&self, seen: u32) {
-        let mut bed = lock(&self.bed);
-        self.sleepers.fetch_add(1, Ordering::SeqCst);
-        while self.offers.load(Ordering::SeqCst) == seen {
-            bed = self.wake.wait(bed).unwrap_or_else(PoisonError::into_inner);
-        }
-        self.sleepers.fetch_sub(1, Ordering::SeqCst);
-    }
-
-    /// Tells workers that there is a new job.
-    fn ring(&self, wanted: usize) {
-        self.offers.fetch_add(1, Ordering::SeqCst);
-        // A worker counts itself before it looks at `offers` for the last time: it sees this offer, or is seen here.
-        let sleepers = self.sleepers.load(Ordering::SeqCst);
-        if sleepers == 0 {
-            return;
-        }
-        // With the lock held, a worker between its last look and its sleep is not missed.
-        let _bed = lock(&self.bed);
-        if wanted >= sleepers {
-            self.wake.notify_all();
-        } else {
-            (0..wanted).for_each(|_| self.wake.notify_one());
-        }
-    }
-
-    fn run(&self, threads: usize, tasks: usize, f: &(dyn Fn(usize) + Sync)) {
-        let helpers = threads.min(tasks).min(MAX_THREADS) - 1;
-        let scope = Scope::current();
-        let job = Job {
-            f,
-            tasks,
-            next: AtomicUsize::new(0),
-            threads: helpers + 1,
-            processor: place::processor(),
-            seats: AtomicUsize::new(helpers),
-            stop: scope.map(Scope::flag),
-            panic: Mutex::new(None),
-        };
-        let slot = self
-            .slots
-            .iter()
-            .find(|slot| !slot.taken.swap(true, Ordering::Acquire));
-        if let Some(slot) = slot {
-            slot.job
-                .store((&raw const job).cast_mut().cast(), Ordering::SeqCst);
-            self.ring(helpers);
-        }
-        // Panics of tasks are kept in the job, so that this thread always comes to the end of this function.
-        INSIDE.set(true);
-        let since = Instant::now();
-        // The caller has no pace: it takes tasks to the end, whoever leaves.
-        let taken = job.run(None, || scope.is_some_and(Scope::asks_to_stop));
-        INSIDE.set(false);
-        if let Some(slot) = slot {
-            // No worker can come to the job from here on, and those inside are waited for: after that nobody knows it but this thread.
-            slot.job.store(std::ptr::null_mut(), Ordering::SeqCst);
-            // A worker that runs ends its last task in about the time that ours took; one that does not has lost its core.
-            let patience = SPIN + 2 * since.elapsed() / taken.max(1);
-            slot.wait_until_empty(patience.min(LONGEST_WAIT));
-            slot.taken.store(false, Ordering::Release);
-        }
-        if let Some(panic) = job.panic.into_inner().unwrap_or_else(PoisonError::into_inner) {
-            resume_unwind(panic);
-        }
-    }
-}
+pub const MAX_THREADS: usize = 1024;
 
 thread_local! {
     /// Whether this thread is running a task: a loop inside runs on this thread alone.
@@ -203,28 +43,61 @@ thread_local! {
     static STAYS: Cell<usize> = const { Cell::new(0) };
 }
 
-/// The pool of this process, or of the one that it was forked from; null before anyone needed one. Never freed.
-static POOL: AtomicPtr<Pool> = AtomicPtr::new(std::ptr::null_mut());
+/// The workers of this process; null before anyone needed some. Never freed.
+static WORKERS: AtomicPtr<Workers> = AtomicPtr::new(null_mut());
 
-/// The pool, made at first use. No lock is involved: in a child of `fork` a lock could be held by a thread that does not exist there.
-fn pool() -> &'static Pool {
-    let process = std::process::id();
+/// The workers, made at first use; none where forks would go unnoticed. No lock is involved: in a child of `fork` a lock
+/// could be held by a thread that does not exist there.
+fn workers() -> Option<&'static Workers> {
     loop {
-        let known = POOL.load(Ordering::Acquire);
-        // SAFETY: null, or a pool that was leaked below.
-        match unsafe { known.as_ref() } {
-            Some(pool) if pool.process == process => return pool,
-            _ => {
-                let fresh = Box::into_raw(Box::new(Pool::new(process)));
-                if POOL
-                    .compare_exchange(known, fresh, Ordering::AcqRel, Ordering::Acquire)
-                    .is_err()
-                {
-                    // SAFETY: another thread was faster; nobody has seen this one.
-                    drop(unsafe { Box::from_raw(fresh) });
-                }
-            }
+        // SAFETY: null, or workers that were leaked below.
+        if let Some(workers) = unsafe { WORKERS.load(Ordering::Acquire).as_ref() } {
+            return Some(workers);
         }
+        if !forks::are_noticed() {
+            return None;
+        }
+        let fresh = Box::into_raw(Box::new(Workers::new()));
+        if WORKERS
+            .compare_exchange(null_mut(), fresh, Ordering::AcqRel, Ordering::Acquire)
+            .is_err()
+        {
+            // SAFETY: another thread was faster; nobody has seen these.
+            drop(unsafe { Box::from_raw(fresh) });
+        }
+    }
+}
+
+/// Forks: a child has the memory of the workers but not their threads, so it gets new ones when it needs some.
+#[cfg(all(unix, not(saccade_portable)))]
+mod forks {
+    use std::ptr::null_mut;
+    use std::sync::atomic::{AtomicBool, Ordering};
+
+    use super::WORKERS;
+
+    /// Whether children of this process will know that they are. A process id would not do: it is used again.
+    pub(super) fn are_noticed() -> bool {
+        static NOTICED: AtomicBool = AtomicBool::new(false);
+        if !NOTICED.load(Ordering::Acquire) {
+            // SAFETY: the handler only stores to an atomic, which may be done in a child of a process with threads. Of two
+            // handlers the second does nothing.
+            let status = unsafe { libc::pthread_atfork(None, None, Some(forget)) };
+            NOTICED.store(status == 0, Ordering::Release);
+        }
+        NOTICED.load(Ordering::Acquire)
+    }
+
+    extern "C" fn forget() {
+        WORKERS.store(null_mut(), Ordering::Release);
+    }
+}
+
+/// Where there are no forks, or no system calls.
+#[cfg(not(all(unix, not(saccade_portable))))]
+mod forks {
+    pub(super) fn are_noticed() -> bool {
+        true
     }
 }
 
@@ -249,16 +122,32 @@ fn pool() -> &'static Pool {
 /// assert_eq!(sum.into_inner(), 10);
 /// ```
 pub fn parallel_for(threads: usize, tasks: usize, f: &(dyn Fn(usize) + Sync)) {
-    if usable(threads) <= 1 || tasks <= 1 {
-        match Scope::current() {
-            None => (0..tasks).for_each(f),
-            Some(scope) => (0..tasks).take_while(|_| !scope.asks_to_stop()).for_each(f),
+    /// Makes the calling thread one that is running no task.
+    struct Outside;
+
+    impl Drop for Outside {
+        fn drop(&mut self) {
+            INSIDE.set(false);
         }
-    } else {
-        let pool = pool();
-        pool.start_workers(threads.min(tasks).min(MAX_THREADS) - 1);
-        pool.run(threads, tasks, f);
     }
+
+    let threads = usable(threads).min(tasks).min(MAX_THREADS);
+    let workers = if threads > 1 { workers() } else { None };
+    Scope::with_current(|scope| match (workers, scope) {
+        (None, None) => (0..tasks).for_each(f),
+        (None, Some(scope)) => (0..tasks).take_while(|_| !scope.asks_to_stop()).for_each(f),
+        (Some(workers), _) => {
+            workers.start(threads - 1, || INSIDE.set(true));
+            INSIDE.set(true);
+            let outside = Outside;
+            let asks_to_stop = || scope.is_some_and(Scope::asks_to_stop);
+            let outcome = workers.run(threads - 1, tasks, f, scope.map(Scope::flag), asks_to_stop);
+            drop(outside);
+            if let Err(panic) = outcome {
+                resume_unwind(panic);
+            }
+        }
+    });
 }
 
 /// The loops that the calling thread starts run on this thread alone, as within a task, until what this returns is dropped.
@@ -297,10 +186,14 @@ pub(crate) fn usable(threads: usize) -> usize {
     }
 }
 
-#[cfg(test)]
+#[cfg(all(test, not(loom)))]
 mod tests {
     use std::panic::{AssertUnwindSafe, catch_unwind};
+    use std::sync::Mutex;
+    use std::sync::atomic::AtomicUsize;
+    use std::time::{Duration, Instant};
 
+    use super::workers::{SLOTS, SPIN};
     use super::*;
 
     fn visits(threads: usize, tasks: usize) -> Vec<usize> {
@@ -401,13 +294,13 @@ mod tests {
             let threads = Mutex::new(std::collections::HashSet::new());
             let since = Instant::now();
             parallel_for(2, 2, &|_| {
-                lock(&threads).insert(std::thread::current().id());
+                threads.lock().unwrap().insert(std::thread::current().id());
                 // Neither of the two goes on before the other is there, so that a busy machine only makes this longer.
-                while lock(&threads).len() < 2 && since.elapsed() < Duration::from_secs(20) {
+                while threads.lock().unwrap().len() < 2 && since.elapsed() < Duration::from_secs(20) {
                     std::thread::yield_now();
                 }
             });
-            assert_eq!(lock(&threads).len(), 2);
+            assert_eq!(threads.lock().unwrap().len(), 2);
         }
     }
 }

@@ -11,11 +11,11 @@ const PATIENCE: Duration = Duration::from_millis(1);
 
 /// The processor that runs the calling thread, if the system reports it.
 pub(super) fn processor() -> Option<usize> {
-    #[cfg(target_os = "linux")]
+    #[cfg(all(target_os = "linux", not(saccade_portable)))]
     {
         linux::processor()
     }
-    #[cfg(not(target_os = "linux"))]
+    #[cfg(not(all(target_os = "linux", not(saccade_portable))))]
     {
         None
     }
@@ -40,54 +40,73 @@ impl Place {
             return;
         }
         self.asked = Some(Instant::now());
-        #[cfg(target_os = "linux")]
+        #[cfg(all(target_os = "linux", not(saccade_portable)))]
         if let Some(caller) = caller {
             linux::leave(caller, threads);
         }
-        #[cfg(not(target_os = "linux"))]
+        #[cfg(not(all(target_os = "linux", not(saccade_portable))))]
         let _ = threads;
     }
 }
 
-#[cfg(target_os = "linux")]
+#[cfg(all(target_os = "linux", not(saccade_portable)))]
 mod linux {
-    use libc::{CPU_CLR, CPU_COUNT, cpu_set_t, sched_getaffinity, sched_getcpu, sched_setaffinity};
+    /// Processors that a set can hold, as the C library's can. On a machine with more, threads stay where they are.
+    const MOST: usize = 1024;
 
-    pub(super) fn processor() -> Option<usize> {
-        // SAFETY: takes nothing and returns a number.
-        usize::try_from(unsafe { sched_getcpu() }).ok()
-    }
+    /// A bit for each processor, as the kernel has them.
+    #[derive(Clone, Copy, PartialEq)]
+    pub(super) struct Processors([usize; MOST / usize::BITS as usize]);
 
-    /// The processors that the calling thread may use. None on a machine with more of them than the set can hold.
-    pub(super) fn allowed() -> Option<cpu_set_t> {
-        // SAFETY: a set of bits, for which zeros are valid; it lives during the call, which gets its size.
-        unsafe {
-            let mut set: cpu_set_t = std::mem::zeroed();
-            (sched_getaffinity(0, size_of::<cpu_set_t>(), &raw mut set) == 0).then_some(set)
+    impl Processors {
+        pub(super) fn len(&self) -> usize {
+            self.0.iter().map(|word| word.count_ones() as usize).sum()
+        }
+
+        /// The others, where there are any.
+        fn without(mut self, processor: usize) -> Option<Self> {
+            let bits = usize::BITS as usize;
+            *self.0.get_mut(processor / bits)? &= !(1 << (processor % bits));
+            (self.len() > 0).then_some(self)
         }
     }
 
-    fn allow(set: &cpu_set_t) -> bool {
-        // SAFETY: the set lives during the call, which gets its size.
-        unsafe { sched_setaffinity(0, size_of::<cpu_set_t>(), set) == 0 }
+    pub(super) fn processor() -> Option<usize> {
+        // SAFETY: takes nothing and returns a number.
+        usize::try_from(unsafe { libc::sched_getcpu() }).ok()
+    }
+
+    /// The processors that the calling thread may use.
+    pub(super) fn allowed() -> Option<Processors> {
+        let mut bits = [0; MOST / usize::BITS as usize];
+        // SAFETY: writes as many bytes as it is told at most; any bits are numbers.
+        let status = unsafe { libc::sched_getaffinity(0, size_of_val(&bits), bits.as_mut_ptr().cast()) };
+        (status == 0).then_some(Processors(bits))
+    }
+
+    fn allow(Processors(bits): &Processors) -> bool {
+        // SAFETY: reads as many bytes as it is told.
+        unsafe { libc::sched_setaffinity(0, size_of_val(bits), bits.as_ptr().cast()) == 0 }
     }
 
     /// Forbids the calling thread `processor` for a moment: the system moves it at once, and it stays where it was moved to.
+    ///
+    /// Somebody else may change the mask meanwhile (`taskset -a`). Then it is left as they want it, unless their change
+    /// comes within the few instructions between two of these calls.
     pub(super) fn leave(processor: usize, threads: usize) {
-        let Some(all) = allowed() else { return };
-        let mut others = all;
-        // SAFETY: bits of sets that live here; a processor that runs a thread which may use it is within the set.
-        let enough = unsafe {
-            CPU_CLR(processor, &mut others);
-            usize::try_from(CPU_COUNT(&all)).is_ok_and(|count| count >= threads) && CPU_COUNT(&others) > 0
+        let Some(all) = allowed().filter(|all| all.len() >= threads) else {
+            return;
         };
-        if enough && allow(&others) {
+        let Some(others) = all.without(processor) else {
+            return;
+        };
+        if allow(&others) && allowed() == Some(others) {
             allow(&all);
         }
     }
 }
 
-#[cfg(all(test, target_os = "linux"))]
+#[cfg(all(test, target_os = "linux", not(saccade_portable)))]
 mod tests {
     use super::*;
 
@@ -95,20 +114,13 @@ mod tests {
     fn a_thread_leaves_and_may_use_the_same_processors_as_before() {
         // In a thread of its own: where it may run must not matter to other tests.
         let moved = std::thread::spawn(|| {
-            let bits = |set: libc::cpu_set_t| {
-                // SAFETY: looks at bits within the set.
-                (0..1024)
-                    .map(|cpu| unsafe { libc::CPU_ISSET(cpu, &set) })
-                    .collect::<Vec<_>>()
-            };
-            let before = bits(linux::allowed().unwrap());
-            let count = before.iter().filter(|&&bit| bit).count();
-            let mut moved = count < 2;
+            let before = linux::allowed().unwrap();
+            let mut moved = before.len() < 2;
             for _ in 0..20 {
                 let here = processor();
                 Place::new().apart_from(here, 2);
                 moved |= processor() != here;
-                assert_eq!(bits(linux::allowed().unwrap()), before);
+                assert!(linux::allowed().unwrap() == before);
             }
             moved
         });
