@@ -155,7 +155,10 @@ mod tests {
         assert!(error.to_string().starts_with(&expected), "{error}");
         let mut scratch = Scratch::default();
         let error = scratch.slice(usize::MAX / 8).unwrap_err();
-        let expected = format!("activations: cannot allocate {} bytes of memory", usize::MAX / 8 * 4);
+        let expected = format!(
+            "activations: cannot allocate {} bytes of memory",
+            usize::MAX / 8 * 4
+        );
         assert!(error.to_string().starts_with(&expected), "{error}");
         assert_eq!(scratch.slice(3).unwrap(), [0.0; 3], "usable afterwards");
     }
