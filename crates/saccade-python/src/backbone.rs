@@ -203,7 +203,7 @@ fn options(
 fn backbone_config_dict<'py>(py: Python<'py>, config: &BackboneConfig) -> PyResult<Bound<'py, PyDict>> {
     let dict = PyDict::new(py);
     let (vision, language) = (&config.vision, &config.language);
-    dict.set_item("version", &config.version)?;
+    dict.set_item("version", config.version.name())?;
     for (name, size) in [
         ("feature_dim", config.feature_dim()),
         ("image_token_id", config.image_token_id),

@@ -8,7 +8,7 @@ use crate::detached::call;
 
 pub(crate) fn config_dict<'py>(py: Python<'py>, config: &HeadConfig) -> PyResult<Bound<'py, PyDict>> {
     let dict = PyDict::new(py);
-    dict.set_item("version", &config.version)?;
+    dict.set_item("version", config.version.name())?;
     dict.set_item("mask_mode", config.mask_mode())?;
     let decoders = config.decoders.iter().map(|(name, width)| (name, *width));
     dict.set_item("decoders", PyTuple::new(py, decoders)?)?;

@@ -55,7 +55,7 @@ impl ProcessorSource {
 
     #[getter]
     fn version(&self) -> &'static str {
-        self.0.version()
+        self.0.version().name()
     }
 
     #[getter]
@@ -104,7 +104,7 @@ impl Processor {
         };
         call(py, || {
             let tokenizer = Tokenizer::read(&TokenizerFiles::at(&tokenizer)?)?;
-            saccade_vla::Processor::new(version, tokenizer, &options)
+            saccade_vla::Processor::new(version.parse()?, tokenizer, &options)
         })
         .map(Self)
     }
@@ -131,7 +131,7 @@ impl Processor {
 
     #[getter]
     fn version(&self) -> &'static str {
-        self.0.version()
+        self.0.version().name()
     }
 
     #[getter]

@@ -18,19 +18,19 @@ pub struct TensorSpec {
     pub shape: Vec<usize>,
     /// Whether it may be stored as int8 with a scale for each row.
     pub may_be_int8: bool,
-    /// Whether its first axis is of embodiments.
-    pub per_embodiment: bool,
+    /// Whether its first axis counts equal layers, of which a row of a batch uses one.
+    pub is_stacked: bool,
 }
 
 impl TensorSpec {
-    /// A floating-point tensor that all embodiments share.
+    /// A floating-point tensor of one layer.
     #[must_use]
     pub fn plain(name: &str, shape: &[usize]) -> Self {
         Self {
             name: name.to_owned(),
             shape: shape.to_vec(),
             may_be_int8: false,
-            per_embodiment: false,
+            is_stacked: false,
         }
     }
 }

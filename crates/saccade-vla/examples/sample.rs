@@ -27,7 +27,7 @@ fn main() -> Result<()> {
     let config = head.config();
     println!(
         "GR00T {}: {} blocks of width {}, {} on {} threads, {:.1} MB",
-        config.version.to_uppercase(),
+        config.version,
         config.num_layers,
         config.width,
         head.engine().isa,

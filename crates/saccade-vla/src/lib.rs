@@ -34,6 +34,9 @@ mod precision;
 mod processor;
 mod profile;
 mod recognise;
+// Rows say what processors do, also where none is compiled.
+#[cfg_attr(not(feature = "processor"), allow(dead_code, unused_imports))]
+mod release;
 #[cfg(feature = "rewrite")]
 mod rewrite;
 mod sampling;
@@ -64,11 +67,14 @@ pub use ops::interruptible;
 pub use precision::Precision;
 #[cfg(feature = "processor")]
 pub use processor::{
-    Frame, Observation, Prepared, Preprocessing, Processor, ProcessorOptions, ProcessorSource, Tokenizer,
-    TokenizerFiles, View,
+    Frame, Observation, Prepared, Processor, ProcessorOptions, ProcessorSource, Tokenizer, TokenizerFiles,
+    View,
 };
 pub use profile::{Counter, Part, Profile, Profiling};
 pub use recognise::{HeadCheckpoint, TensorFacts};
+#[cfg(feature = "processor")]
+pub use release::Preprocessing;
+pub use release::Version;
 #[cfg(feature = "rewrite")]
 pub use rewrite::{
     ConvertOptions, ConvertReport, Float, MergedTokens, QuantizeReport, ResizeOptions, ResizeReport,

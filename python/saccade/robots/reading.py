@@ -29,8 +29,8 @@ PROCESSOR_FOLDER = "processor"
 #: The data config of a policy that saccade trained. Checkpoints of the released code have no such file.
 OWN_DATA_CONFIG = "experiment_cfg/data_config.json"
 
-#: Versions by ``model_type`` of ``config.json``.
-MODEL_TYPES = {"Gr00tN1d6": "n1.6", "Gr00tN1d7": "n1.7"}
+#: Versions by ``model_type`` of ``config.json``, which the processor's class is called after.
+MODEL_TYPES = {name.removesuffix("Processor"): version for name, version in CLASSES.items()}
 
 
 def read(

@@ -93,3 +93,20 @@ fn config_of(source: &Path) -> Result<GivenConfig> {
         false => GivenConfig::parse("{}"),
     }
 }
+
+/// The tensors of a published backbone, by their names without a prefix.
+#[cfg(all(test, feature = "processor"))]
+pub(crate) fn published_specs(
+    version: crate::release::Version,
+) -> Result<Vec<saccade_vla_checkpoint::TensorSpec>> {
+    let rules = version
+        .release()
+        .backbone
+        .as_ref()
+        .expect("a release with a backbone");
+    let found = Recognised::new(
+        rules.marks().iter().map(String::as_str),
+        &GivenConfig::parse("{}")?,
+    )?;
+    Ok(plan(|weights| found.layers(weights))?.specs)
+}

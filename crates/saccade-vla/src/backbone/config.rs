@@ -1,18 +1,22 @@
 //! The sizes and switches of a backbone.
 
-/// The sizes and switches of a vision-language backbone: of its vision tower, of the connector behind that, and of its language model.
+use crate::release::{PatchOrder, PixelOrder, Version};
+
+/// The sizes and switches of a vision-language backbone: of its vision tower, of the connector behind that,
+/// and of its language model.
 #[derive(Clone, Debug, PartialEq)]
 #[non_exhaustive]
 pub struct BackboneConfig {
-    /// Release of the architecture: `"n1.5"`, `"n1.6"` or `"n1.7"`. The other fields define what the backbone computes.
-    pub version: String,
+    /// Release of the architecture. The other fields define what the backbone computes.
+    pub version: Version,
     /// Of the tower that encodes each view by itself, and of the connector that makes tokens of its patches.
     pub vision: VisionConfig,
     /// Of the model that reads tokens of views and words.
     pub language: LanguageConfig,
     /// Width of the features where a last layer changes it (`project_to_dim`).
     pub project_to_dim: Option<usize>,
-    /// The id in the prompt that a token of a view takes the place of (`image_token_index`, `image_token_id`).
+    /// The id in the prompt that a token of a view takes the place of (`image_token_index`,
+    /// `image_token_id`).
     pub image_token_id: usize,
 }
 
@@ -69,7 +73,8 @@ pub struct LanguageConfig {
     pub norm_eps: f64,
     /// Base of the frequencies of the rotary positions.
     pub rope_theta: f64,
-    /// How many of the pairs of a head turn with time, height and width; none if all turn with the place in the prompt.
+    /// How many of the pairs of a head turn with time, height and width; none if all turn with the place in
+    /// the prompt.
     pub mrope_section: Option<[usize; 3]>,
     /// Whether the features are normed.
     pub has_final_norm: bool,
@@ -92,24 +97,6 @@ pub(crate) enum Tower {
         /// Frames of a patch.
         frames: usize,
     },
-}
-
-/// The order of the pixels in a patch, last axis fastest.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum PixelOrder {
-    /// Channel, row, column.
-    ChannelFirst,
-    /// Row, column, channel.
-    ChannelLast,
-}
-
-/// The order of the elements of the square of patches that makes a token, last axis fastest.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum PatchOrder {
-    /// Row, column, element of the patch.
-    PatchFirst,
-    /// Element of the patch, row, column.
-    PatchLast,
 }
 
 /// Channels of a pixel.

@@ -198,13 +198,13 @@ fn views<'a>(config: &BackboneConfig, inputs: &BackboneInputs<'a>) -> Result<Vec
     match (config.vision.tower, inputs.image_grid_thw) {
         (Tower::Siglip { .. }, Some(_)) => Err(Error::Input(problem!(
             "image_grid_thw"; "expected none, since GR00T {} takes images, not patches",
-            config.version.to_uppercase()
+            config.version
         ))),
         (Tower::Siglip { .. }, None) => images(&config.vision, inputs),
         (Tower::Qwen3Vl { .. }, None) => Err(Error::Input(problem!(
             "image_grid_thw";
             expected "(views, 3), the patches of each view, since GR00T {} takes patches",
-            config.version.to_uppercase();
+            config.version;
             got "none"
         ))),
         (Tower::Qwen3Vl { patch_elements, .. }, Some(grid)) => {

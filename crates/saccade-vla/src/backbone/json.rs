@@ -6,9 +6,9 @@ use serde_json::{Map, Value};
 
 use super::config::{BackboneConfig, CHANNELS, LanguageConfig, Tower, VisionConfig};
 use super::consistency::contradictions;
-use super::released::{Release, TowerKind};
-use crate::config::{Object, Version};
+use crate::config::Object;
 use crate::error::{Error, Problem, Result, problem};
+use crate::release::{BackboneRules, TowerKind, Version};
 
 /// No size in a config is larger: products of three of them stay far below `u64::MAX`.
 const MAX_SIZE: u64 = 1 << 20;
@@ -88,8 +88,8 @@ impl GivenConfig {
     ///
     /// # Errors
     /// [`Error::Checkpoint`] with everything that is of the wrong type or contradictory.
-    pub(crate) fn read(&self, release: &Release) -> Result<BackboneConfig> {
-        let Ok(Value::Object(released)) = serde_json::from_str(release.sizes) else {
+    pub(crate) fn read(&self, version: Version, rules: &BackboneRules) -> Result<BackboneConfig> {
+        let Ok(Value::Object(released)) = serde_json::from_str(rules.sizes) else {
             unreachable!("the released sizes are an object");
         };
         let mut reader = Reader {
@@ -97,7 +97,7 @@ impl GivenConfig {
             released,
             problems: Vec::new(),
         };
-        let config = reader.config(release);
+        let config = reader.config(version, rules);
         if reader.problems.is_empty() {
             return Ok(config);
         }
@@ -142,19 +142,19 @@ struct Reader<'a> {
 }
 
 impl Reader<'_> {
-    fn config(&mut self, release: &Release) -> BackboneConfig {
+    fn config(&mut self, version: Version, rules: &BackboneRules) -> BackboneConfig {
         for section in [Section::Vision, Section::Text, Section::Eagle, Section::Tokens] {
             let key = section.key();
             if self.given.sizes.get(key).is_some_and(|value| !value.is_object()) {
                 self.problems.push(format!("{key}: expected an object"));
             }
         }
-        let vision = self.vision(release);
-        let language = self.language(release);
+        let vision = self.vision(rules);
+        let language = self.language(rules);
         let config = BackboneConfig {
-            version: release.version.name().to_owned(),
+            version,
             project_to_dim: self.project_to_dim(),
-            image_token_id: self.image_token_id(release),
+            image_token_id: self.image_token_id(rules),
             vision,
             language,
         };
@@ -164,9 +164,9 @@ impl Reader<'_> {
         config
     }
 
-    fn vision(&mut self, release: &Release) -> VisionConfig {
+    fn vision(&mut self, rules: &BackboneRules) -> VisionConfig {
         use Section::{Eagle, Vision};
-        let [layers, heads] = match release.tower {
+        let [layers, heads] = match rules.tower {
             TowerKind::Siglip { .. } => ["num_hidden_layers", "num_attention_heads"],
             TowerKind::Qwen3Vl => ["depth", "num_heads"],
         };
@@ -195,7 +195,7 @@ impl Reader<'_> {
                 frames: 0,
             },
         };
-        match release.tower {
+        match rules.tower {
             TowerKind::Siglip {
                 pixels,
                 patches,
@@ -231,7 +231,7 @@ impl Reader<'_> {
         config
     }
 
-    fn language(&mut self, release: &Release) -> LanguageConfig {
+    fn language(&mut self, rules: &BackboneRules) -> LanguageConfig {
         use Section::Text;
         self.expect(Text, "hidden_act", &["silu"].map(Value::from));
         self.expect(Text, "attention_bias", &[Value::from(false)]);
@@ -256,7 +256,7 @@ impl Reader<'_> {
             norm_eps: self.number(Text, "rms_norm_eps"),
             rope_theta: self.number(Text, "rope_theta"),
             mrope_section,
-            has_final_norm: release.has_final_norm,
+            has_final_norm: rules.has_final_norm,
         }
     }
 
@@ -300,8 +300,8 @@ impl Reader<'_> {
         Some(self.whole("project_to_dim", Some(found), 1..=MAX_SIZE))
     }
 
-    fn image_token_id(&mut self, release: &Release) -> usize {
-        let (section, key) = match release.tower {
+    fn image_token_id(&mut self, rules: &BackboneRules) -> usize {
+        let (section, key) = match rules.tower {
             TowerKind::Siglip { .. } => (Section::Eagle, "image_token_index"),
             TowerKind::Qwen3Vl => (Section::Tokens, "image_token_id"),
         };

@@ -12,15 +12,18 @@ mod load;
 mod model;
 mod qwen3;
 mod recognise;
-mod released;
 mod reuse;
 mod token_positions;
 mod vision;
 
 pub use checkpoint::BackboneCheckpoint;
+#[cfg(all(test, feature = "processor"))]
+pub(crate) use checkpoint::published_specs;
 pub use config::{BackboneConfig, LanguageConfig, VisionConfig};
 pub use encode::BackboneKeep;
 pub use features::{BackboneFeatures, BackboneRecord};
 pub use inputs::BackboneInputs;
 pub use load::BackboneLoadOptions;
 pub use model::Backbone;
+#[cfg(feature = "processor")]
+pub(crate) use recognise::backbones_in;

@@ -4,11 +4,9 @@ use saccade_vla_checkpoint::spec::{self, TensorProblem};
 
 use super::config::BackboneConfig;
 use super::json::GivenConfig;
-use super::released::{Names, Release};
 use crate::error::{Error, Result, problem};
-
-/// What the names of a backbone's tensors begin with: lerobot's checkpoints, NVIDIA's, a backbone alone.
-pub(super) const PREFIXES: [&str; 3] = ["_groot_model.backbone.", "backbone.", ""];
+use crate::recognise::BACKBONE_PREFIXES;
+use crate::release::{BackboneRules, Names, Version};
 
 /// What the tensors of a backbone are called, below the prefix.
 pub(super) struct TensorNames {
@@ -20,7 +18,7 @@ pub(super) struct TensorNames {
 /// A backbone in a list of tensors.
 pub(super) struct Recognised {
     pub prefix: &'static str,
-    pub release: &'static Release,
+    pub version: Version,
     pub names: TensorNames,
     pub config: BackboneConfig,
 }
@@ -29,54 +27,42 @@ impl Recognised {
     /// The backbone among tensors of these names, with the config that was given for it.
     ///
     /// # Errors
-    /// [`Error::Checkpoint`] if there is none, if there are two, if the config is of another one, and as the config has them.
+    /// [`Error::Checkpoint`] if there is none, if there are two, if the config is of another one, and as the
+    /// config has them.
     pub(super) fn new<'a>(names: impl Iterator<Item = &'a str> + Clone, given: &GivenConfig) -> Result<Self> {
-        let mut found: Vec<(&'static str, &'static Release)> = Vec::new();
-        for prefix in PREFIXES {
-            for release in Release::all() {
-                let marks = release.marks();
-                let is_own = |name: &str| {
-                    let name = name.strip_prefix(prefix);
-                    name.is_some_and(|name| marks.iter().any(|mark| name.starts_with(mark)))
-                };
-                if names.clone().any(is_own) {
-                    found.push((prefix, release));
-                }
-            }
-        }
-        let (prefix, release) = match found[..] {
+        let found = backbones_in(names.clone());
+        let (prefix, version, rules) = match found[..] {
             [one] => one,
             [] => return Err(nothing_found(names)),
             [first, second, ..] => {
-                let show = |(prefix, release): (&str, &Release)| {
-                    format!("of GR00T {} under `{prefix}`", release.version.title())
-                };
+                let show =
+                    |(prefix, version, _): (&str, Version, _)| format!("of GR00T {version} under `{prefix}`");
                 return Err(Error::Checkpoint(problem!(
                     "source"; "two backbones in one checkpoint, {} and {}", show(first), show(second)
                 )));
             }
         };
-        if let Some((version, words)) = given.version()?
-            && version != release.version
+        if let Some((other, words)) = given.version()?
+            && other != version
         {
             return Err(Error::Checkpoint(problem!(
-                "config"; "{words}, but the tensors are those of GR00T {}", release.version.title()
+                "config"; "{words}, but the tensors are those of GR00T {version}"
             )));
         }
-        let config = given.read(release)?;
-        let own = format!("{}.embed_tokens", release.names.language);
+        let config = given.read(version, rules)?;
+        let own = format!("{}.embed_tokens", rules.names.language);
         let is_there = |name: &str| {
             let name = format!("{prefix}{name}.weight");
             names.clone().any(|other| other == name)
         };
-        let has_twin_only = !is_there(&own) && is_there(release.names.lm_head);
+        let has_twin_only = !is_there(&own) && is_there(rules.names.lm_head);
         Ok(Self {
             prefix,
-            release,
+            version,
             names: TensorNames {
-                parts: release.names,
+                parts: rules.names,
                 embedding: match has_twin_only {
-                    true => release.names.lm_head.to_owned(),
+                    true => rules.names.lm_head.to_owned(),
                     false => own,
                 },
             },
@@ -84,8 +70,9 @@ impl Recognised {
         })
     }
 
-    /// Whether a checkpoint may hold a tensor `name`, without the prefix, that nothing of the backbone reads: the pooling head of SigLIP, the
-    /// twin of the embeddings, layers of the language model beyond the last one that is kept, and its norm where features are not normed.
+    /// Whether a checkpoint may hold a tensor `name`, without the prefix, that nothing of the backbone reads:
+    /// the pooling head of SigLIP, the twin of the embeddings, layers of the language model beyond the last
+    /// one that is kept, and its norm where features are not normed.
     pub(super) fn is_unused(&self, name: &str) -> bool {
         let Names {
             vision,
@@ -120,22 +107,42 @@ impl Recognised {
 
     /// All problems, one on a line.
     pub(super) fn list(&self, problems: &[TensorProblem]) -> String {
-        let what = format!("the backbone of GR00T {}", self.release.version.title());
+        let what = format!("the backbone of GR00T {}", self.version);
         spec::list(problems, &what)
     }
+}
+
+/// All backbones among tensors of these names, with the prefix of each.
+pub(crate) fn backbones_in<'a>(
+    names: impl Iterator<Item = &'a str> + Clone,
+) -> Vec<(&'static str, Version, &'static BackboneRules)> {
+    let mut found = Vec::new();
+    for prefix in BACKBONE_PREFIXES {
+        for (version, rules) in Version::backbones() {
+            let marks = rules.marks();
+            let is_own = |name: &str| {
+                let name = name.strip_prefix(prefix);
+                name.is_some_and(|name| marks.iter().any(|mark| name.starts_with(mark)))
+            };
+            if names.clone().any(is_own) {
+                found.push((prefix, version, rules));
+            }
+        }
+    }
+    found
 }
 
 /// The error for a checkpoint without a backbone.
 fn nothing_found<'a>(mut names: impl Iterator<Item = &'a str> + Clone) -> Error {
     let count = names.clone().count();
     let like = |prefix: &str| names.clone().find(|name| name.starts_with(prefix));
-    let other = PREFIXES
+    let other = BACKBONE_PREFIXES
         .iter()
         .filter(|prefix| !prefix.is_empty())
         .find_map(|prefix| like(prefix));
     if let Some(name) = other {
-        let known: Vec<String> = Release::all()
-            .map(|release| format!("{} ({})", release.names.vision, release.version.title()))
+        let known: Vec<String> = Version::backbones()
+            .map(|(version, rules)| format!("{} ({version})", rules.names.vision))
             .collect();
         return Error::Checkpoint(problem!(
             "source";
@@ -148,6 +155,6 @@ fn nothing_found<'a>(mut names: impl Iterator<Item = &'a str> + Clone) -> Error 
         .map_or_else(String::new, |name| format!(", such as {name}"));
     Error::Checkpoint(problem!(
         "source"; "there is no backbone among the {count} tensors{first}: expected names that begin with {}",
-        PREFIXES .iter() .filter(|prefix| !prefix.is_empty()) .map(|prefix| format!("`{prefix}`")) .collect::<Vec<_>>() .join(" or ")
+        BACKBONE_PREFIXES .iter() .filter(|prefix| !prefix.is_empty()) .map(|prefix| format!("`{prefix}`")) .collect::<Vec<_>>() .join(" or ")
     ))
 }

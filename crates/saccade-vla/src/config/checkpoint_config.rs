@@ -2,8 +2,8 @@
 
 use serde_json::{Map, Value};
 
-use super::versions::Version;
 use crate::error::{Error, Problem, Result};
+use crate::release::Version;
 
 /// A JSON object.
 pub(crate) type Object = Map<String, Value>;
@@ -31,7 +31,8 @@ pub(crate) struct Declared {
 
 impl CheckpointConfig {
     /// # Errors
-    /// [`Error::Json`] for text that is not JSON; [`Error::Checkpoint`] if it is no object, and if the head's config in it is none or has saccade's key next to it.
+    /// [`Error::Json`] for text that is not JSON; [`Error::Checkpoint`] if it is no object, and if the head's
+    /// config in it is none or has saccade's key next to it.
     pub(crate) fn parse(text: &str) -> Result<Self> {
         let bad = |problem: String| Err(Error::Checkpoint(Problem::new("config", problem)));
         let mut top = match serde_json::from_str(text) {

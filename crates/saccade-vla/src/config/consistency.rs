@@ -1,12 +1,13 @@
-//! Whether the sizes and switches of a head's config agree with each other.
+//! Contradictions between the sizes and switches of a head's config.
 
 use serde_json::Value;
 
 use super::checkpoint_config::Object;
 use super::head_config::{HeadConfig, MAX_SIZE};
-use super::versions::Version;
+use crate::release::Version;
 
-/// Everything in a head's config that contradicts itself. `head` and `dit` are the objects that it was read from.
+/// Everything in a head's config that contradicts itself. `head` and `dit` are the objects that it was read
+/// from.
 pub(super) fn contradictions(
     version: Version,
     config: &HeadConfig,
@@ -40,8 +41,8 @@ pub(super) fn contradictions(
     let cross = "diffusion_model_cfg.cross_attention_dim";
     match number(dit, "cross_attention_dim") {
         Some(given) => equal(cross, given, "backbone_embedding_dim", config.context_dim),
-        // Null means the width; the later versions give their class `backbone_embedding_dim` instead.
-        None if version == Version::N15 => equal(
+        // Null means the width; flat configs give their class `backbone_embedding_dim` instead.
+        None if !version.is_flat() => equal(
             &format!("{cross} (null, so input_embedding_dim)"),
             config.width,
             "backbone_embedding_dim",

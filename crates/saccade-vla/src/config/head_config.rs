@@ -1,17 +1,17 @@
 //! The sizes and switches of an action head.
 //!
-//! The keys in JSON are the released ones (`input_embedding_dim`, `num_target_vision_tokens`); the fields of [`HeadConfig`] have the names that
-//! are used everywhere else.
+//! The keys in JSON are the released ones (`input_embedding_dim`, `num_target_vision_tokens`); the fields of
+//! [`HeadConfig`] have the names that are used everywhere else.
 
-use super::versions::{Feature, Version};
 use crate::error::{Error, Result, problem};
+use crate::release::{Feature, Version};
 
 /// The sizes and switches of an action head.
 #[derive(Clone, Debug, PartialEq)]
 #[non_exhaustive]
 pub struct HeadConfig {
-    /// Release of the architecture: `"n1"`, `"n1.5"`, `"n1.6"` or `"n1.7"`. The other fields define what the head computes.
-    pub version: String,
+    /// Release of the architecture. The other fields define what the head computes.
+    pub version: Version,
     /// Width of the diffusion transformer (`input_embedding_dim`).
     pub width: usize,
     /// Blocks of the diffusion transformer.
@@ -24,8 +24,9 @@ pub struct HeadConfig {
     pub context_dim: usize,
     /// Whether every second block is self-attention; otherwise all are cross-attention.
     pub interleave_self_attention: bool,
-    /// If n is not 0, cross-attention blocks see attended positions only: every n-th block, starting with the first, sees text, the others
-    /// images (equation 12 of docs/equations.md). 0: all blocks see all positions, whatever the masks.
+    /// If n is not 0, cross-attention blocks see attended positions only: every n-th block, starting with the
+    /// first, sees text, the others images (equation 12 of docs/equations.md). 0: all blocks see all
+    /// positions, whatever the masks.
     pub attend_text_every_n_blocks: usize,
     /// Whether the vision-language tokens pass the norm `vlln`.
     pub use_vlln: bool,
@@ -37,23 +38,25 @@ pub struct HeadConfig {
     pub vl_head_dim: usize,
     /// Learned query rows between state and actions (`num_target_vision_tokens`).
     pub num_future_tokens: usize,
-    /// What is added to the logits of each future key in every self-attention block: the logarithm of the number of tokens that it
-    /// represents (equation 47 of docs/equations.md). Only saccade reads it.
+    /// What is added to the logits of each future key in every self-attention block: the logarithm of the
+    /// number of tokens that it represents (equation 47 of docs/equations.md). Only saccade reads it.
     pub future_key_bias: Option<Vec<f32>>,
     /// Actions in a chunk.
     pub action_horizon: usize,
     /// Width of an action as it is returned.
     pub action_dim: usize,
-    /// Width of an action as it is denoised (`pretrained_action_dim`); elements beyond `action_dim` are held at zero.
+    /// Width of an action as it is denoised (`pretrained_action_dim`); elements beyond `action_dim` are held
+    /// at zero.
     pub encoder_action_dim: usize,
-    /// The decoders: module and width, in the order in which their outputs are concatenated to `action_dim` elements.
+    /// The decoders: module and width, in the order in which their outputs are concatenated to `action_dim`
+    /// elements.
     pub decoders: Vec<(String, usize)>,
     /// Width of the state vector (`max_state_dim`).
     pub state_dim: usize,
     /// State vectors that make a state row (`state_history_length`).
     pub state_history: usize,
-    /// State vectors in an observation, `state_history` for each state row. No config says it: several rows are for models that were trained
-    /// with several states.
+    /// State vectors in an observation, `state_history` for each state row. No config says it: several rows
+    /// are for models that were trained with several states.
     pub num_states: usize,
     /// Hidden width of the encoders and the decoders (`hidden_size`).
     pub hidden_dim: usize,
@@ -102,7 +105,8 @@ impl HeadConfig {
     /// This config with another number of actions in a chunk.
     ///
     /// # Errors
-    /// [`Error::Input`] for none, and for more than the position table has rows or than any config may ask for.
+    /// [`Error::Input`] for none, and for more than the position table has rows or than any config may ask
+    /// for.
     pub(crate) fn with_action_horizon(self, action_horizon: usize) -> Result<Self> {
         let (limit, what) = match self.add_pos_embed {
             true => (
@@ -125,11 +129,10 @@ impl HeadConfig {
     /// This config with another number of states in an observation.
     ///
     /// # Errors
-    /// [`Error::Input`] for none, for more than any config may ask for, and for a version that makes one row of as many states as its config
-    /// says, for another number.
+    /// [`Error::Input`] for none, for more than any config may ask for, and for a version that makes one row
+    /// of as many states as its config says, for another number.
     pub fn with_num_states(self, num_states: usize) -> Result<Self> {
-        let has_history = Version::named(&self.version).is_some_and(|one| one.has(Feature::StateHistory));
-        if has_history && num_states != self.state_history {
+        if self.version.has(Feature::StateHistory) && num_states != self.state_history {
             return Err(Error::Input(problem!(
                 "num_states";
                 expected "{}, since {} makes one row of its last states (state_history_length)",
@@ -145,7 +148,8 @@ impl HeadConfig {
         Ok(Self { num_states, ..self })
     }
 
-    /// How cross-attention blocks take masks: `"none"` ignores them, `"alternate"` is the rule of `attend_text_every_n_blocks`.
+    /// How cross-attention blocks take masks: `"none"` ignores them, `"alternate"` is the rule of
+    /// `attend_text_every_n_blocks`.
     #[must_use]
     pub fn mask_mode(&self) -> &'static str {
         match self.attend_text_every_n_blocks {

@@ -7,8 +7,8 @@ use serde_json::{Map, Value};
 use super::checkpoint_config::{CheckpointConfig, OWN_KEY, Object};
 use super::consistency::contradictions;
 use super::head_config::{HeadConfig, MAX_SIZE};
-use super::versions::{FEATURE_KEYS, Feature, Version};
 use crate::error::{Error, Result, problem};
+use crate::release::{FEATURE_KEYS, Feature, Version};
 
 /// No head has more blocks; the names of their tensors are written out.
 const MAX_LAYERS: u64 = 1024;
@@ -22,7 +22,8 @@ fn has_layers(cfg: &Value) -> bool {
 }
 
 impl HeadConfig {
-    /// Reads a whole checkpoint config (with `action_head_cfg`, or flat as those of N1.6 and N1.7 are) or the head's own.
+    /// Reads a whole checkpoint config (with `action_head_cfg`, or flat as those of N1.6 and N1.7 are) or the
+    /// head's own.
     ///
     /// `model_type` says the version; without it the keys do.
     ///
@@ -59,7 +60,8 @@ struct Reader {
 }
 
 impl Reader {
-    /// The version that `model_type` names, or else the one that the keys of the head belong to.
+    /// The version that `model_type` names. Without it, the one that the keys of the head belong to: configs
+    /// of heads alone did not always name a model.
     fn version(&mut self, config: &CheckpointConfig) -> Version {
         let declared = config.declared();
         if let Some(first) = declared.first() {
@@ -116,9 +118,9 @@ impl Reader {
             true => self.size(head, "", "input_embedding_dim", 1),
             false => num_heads * head_dim,
         };
-        let context_dim = match version {
-            Version::N1 => self.cross_dim(dit).unwrap_or(width),
-            _ => self.size_of(version, head, "backbone_embedding_dim", 1),
+        let context_dim = match version.has(Feature::ContextWidth) {
+            true => self.size_of(version, head, "backbone_embedding_dim", 1),
+            false => self.cross_dim(dit).unwrap_or(width),
         };
         let use_vlln = version.has(Feature::VlNorm) && self.flag(head, "", "use_vlln", Some(true));
         let [vl_num_layers, vl_num_heads, vl_head_dim] = match self.vl_self_attention(version, head, use_vlln)
@@ -134,7 +136,7 @@ impl Reader {
             false => 1,
         };
         let config = HeadConfig {
-            version: version.name().to_owned(),
+            version,
             width,
             num_layers,
             num_heads,
@@ -174,18 +176,18 @@ impl Reader {
         config
     }
 
-    /// Lists keys that ask for what the version's class does not have: a head without it would be silently wrong.
+    /// Lists keys that ask for what the version's class does not have: a head without it would be silently
+    /// wrong.
     fn refuse_keys_of_other_versions(&mut self, version: Version, head: &Object) {
         for (key, feature) in FEATURE_KEYS {
             let Some(given) = head.get(key).filter(|given| is_asked_for(key, given)) else {
                 continue;
             };
             if !version.has(feature) {
-                let names: Vec<_> = Version::with(feature).into_iter().map(Version::name).collect();
+                let names: Vec<_> = Version::with(feature).iter().map(Version::to_string).collect();
                 self.problems.push(format!(
-                    "{key} is {given}, which only {} has, but this is a config of {}",
+                    "{key} is {given}, which only {} has, but this is a config of {version}",
                     names.join(", "),
-                    version.name(),
                 ));
             }
         }
@@ -253,7 +255,8 @@ impl Reader {
             })
             .collect();
         let together: usize = decoders.iter().map(|(_, width)| width).sum();
-        // The fork writes the width of the pretrained encoder as `action_dim` and makes both of it when it loads.
+        // The fork writes the width of the pretrained encoder as `action_dim` and makes both of it when it
+        // loads.
         if pretrained.is_some() && action_dim != together {
             self.problems.push(format!(
                 "action_dim is {action_dim}, but the decoders of {} have {together} outputs",
@@ -331,7 +334,8 @@ impl Reader {
         None
     }
 
-    /// The width that keys and values of the cross-attention are made from, where it is not the transformer's own.
+    /// The width that keys and values of the cross-attention are made from, where it is not the transformer's
+    /// own.
     fn cross_dim(&mut self, dit: &Object) -> Option<usize> {
         let is_given = dit
             .get("cross_attention_dim")

@@ -4,11 +4,9 @@ mod checkpoint_config;
 mod consistency;
 mod head_config;
 mod json;
-mod versions;
 
 #[cfg(feature = "rewrite")]
 pub(crate) use checkpoint_config::HEAD_KEY;
 pub(crate) use checkpoint_config::{CheckpointConfig, OWN_KEY, Object};
 pub use head_config::HeadConfig;
 pub(crate) use head_config::Reads;
-pub(crate) use versions::{Feature, Version};

@@ -170,7 +170,7 @@ impl ActionHead {
                 "attention_mask";
                 "expected no false entry, since this head (GR00T {}) ignores padding masks: leave the mask out to attend to \
                  padding as the released code does, or give its complement as drop_vl to remove these positions",
-                self.config.version.to_uppercase()
+                self.config.version
             )));
         }
         if !ignores_masks && features.image_mask.is_none() {

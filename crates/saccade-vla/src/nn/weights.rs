@@ -152,7 +152,7 @@ impl Weights<'_> {
     pub(crate) fn slice(&self, name: &str, shape: &[usize], id: usize) -> Result<Tensor> {
         self.read(Request {
             spec: TensorSpec {
-                per_embodiment: true,
+                is_stacked: true,
                 ..TensorSpec::plain(&self.name(name), shape)
             },
             slices: Some(id..id + 1),

@@ -5,72 +5,14 @@ use std::path::Path;
 use saccade_vla_checkpoint::read_text;
 use serde_json::{Value, json};
 
-use super::options::{asks_for_nothing, is_argument, is_read};
-use super::settings::{LEROBOT_CROP, LEROBOT_TARGET, Preprocessing};
-use crate::config::{Object, Version};
+use super::options::{asks_for_nothing, is_read};
+use super::settings::{LEROBOT_CROP, LEROBOT_TARGET};
+use crate::config::Object;
 use crate::error::{Error, Result, problem};
+use crate::release::{IsaacFile, LerobotRules, PIXEL_LIMITS, Preprocessing, ProcessorRules, Version};
 
 const PROCESSOR: &str = "processor_config.json";
 const PIPELINE: &str = "policy_preprocessor.json";
-
-/// Steps of lerobot's preprocessors that decide about frames and words, and the keys of their configs.
-const STEPS: [(&str, &[&str]); 5] = [
-    (
-        "groot_pack_inputs_v3",
-        &[
-            "action_horizon",
-            "embodiment_mapping",
-            "embodiment_tag",
-            "formalize_language",
-            "language_key",
-            "max_action_dim",
-            "max_state_dim",
-            "normalize_min_max",
-            "state_horizon",
-        ],
-    ),
-    ("groot_eagle_encode_v3", &["tokenizer_assets_repo"]),
-    ("groot_eagle_collate_v3", &["tokenizer_assets_repo"]),
-    (
-        "groot_n1_7_pack_inputs_v1",
-        &[
-            "action_horizon",
-            "clip_outliers",
-            "embodiment_mapping",
-            "embodiment_tag",
-            "formalize_language",
-            "language_key",
-            "max_action_dim",
-            "max_state_dim",
-            "modality_config",
-            "normalize_min_max",
-            "raw_stats",
-            "state_dropout_prob",
-            "state_horizon",
-            "training",
-            "use_percentiles",
-            "valid_action_horizon",
-            "video_horizon",
-            "video_modality_keys",
-        ],
-    ),
-    (
-        N17_ENCODE,
-        &[
-            "crop_fraction",
-            "device",
-            "image_crop_size",
-            "image_target_size",
-            "letter_box_transform",
-            "model_name",
-            "shortest_image_edge",
-            "training",
-            "use_albumentations",
-        ],
-    ),
-];
-
-const N17_ENCODE: &str = "groot_n1_7_vlm_encode_v1";
 
 /// Steps that leave frames and words as they are.
 const OTHER_STEPS: [&str; 5] = [
@@ -84,26 +26,34 @@ const OTHER_STEPS: [&str; 5] = [
 /// The options in the files of a checkpoint that are read here.
 ///
 /// # Errors
-/// [`Error::Checkpoint`] and [`Error::Json`] for files that are broken, and for keys and steps that their release does not know.
-pub(super) fn options(version: Version, preprocessing: Preprocessing, directory: &Path) -> Result<Object> {
-    let mut options = match (preprocessing, version) {
-        (Preprocessing::Isaac, Version::N16 | Version::N17) => isaac(version, directory)?,
-        (Preprocessing::Isaac, _) => Object::new(),
-        (Preprocessing::Lerobot, _) => lerobot(version, directory)?,
+/// [`Error::Checkpoint`] and [`Error::Json`] for files that are broken, and for keys and steps that their
+/// release does not know.
+pub(super) fn options(
+    version: Version,
+    rules: &ProcessorRules,
+    preprocessing: Preprocessing,
+    directory: &Path,
+) -> Result<Object> {
+    let file = rules.isaac_file.as_ref();
+    let mut options = match (preprocessing, &version.release().lerobot) {
+        (Preprocessing::Isaac, _) => isaac(version, file, directory)?,
+        (Preprocessing::Lerobot, Some(lerobot)) => lerobot_steps(version, lerobot, file, directory)?,
+        (Preprocessing::Lerobot, None) => Object::new(),
     };
-    options.retain(|key, _| is_read(version, key));
-    if version == Version::N17 {
+    options.retain(|key, _| is_read(&rules.views, key));
+    if rules.has_pixel_limits() {
         add_pixel_limits(&mut options, directory)?;
     }
     Ok(options)
 }
 
-/// Adds the least and the greatest area that the `preprocessor_config.json` in `folder` has, if they are not there yet.
+/// Adds the least and the greatest area that the `preprocessor_config.json` in `folder` has, if they are not
+/// there yet.
 ///
 /// # Errors
 /// [`Error::Checkpoint`] and [`Error::Json`] for a file that is broken.
 pub(super) fn add_pixel_limits(options: &mut Object, folder: &Path) -> Result<()> {
-    let Some(file) = read_object("source", &folder.join("preprocessor_config.json"))? else {
+    let Some(file) = read_object("source", &folder.join(PIXEL_LIMITS))? else {
         return Ok(());
     };
     for (key, value) in file {
@@ -115,8 +65,8 @@ pub(super) fn add_pixel_limits(options: &mut Object, folder: &Path) -> Result<()
 }
 
 /// What the file of Isaac-GR00T's processor says; nothing where there is none.
-fn isaac(version: Version, directory: &Path) -> Result<Object> {
-    let Some(mut kwargs) = processor_kwargs(version, directory)? else {
+fn isaac(version: Version, released: Option<&IsaacFile>, directory: &Path) -> Result<Object> {
+    let Some(mut kwargs) = processor_kwargs(version, released, directory)? else {
         return Ok(Object::new());
     };
     // The default of the released constructors.
@@ -124,9 +74,17 @@ fn isaac(version: Version, directory: &Path) -> Result<Object> {
     Ok(kwargs)
 }
 
-/// The `processor_kwargs` of a checkpoint of N1.6 or N1.7: in the folder itself, and where that has none in `processor/`, which is where
-/// training leaves them.
-fn processor_kwargs(version: Version, directory: &Path) -> Result<Option<Object>> {
+/// The `processor_kwargs` of a checkpoint whose release has them: in the folder itself, and where that has
+/// none in `processor/`, which is where training leaves them.
+fn processor_kwargs(
+    version: Version,
+    released: Option<&IsaacFile>,
+    directory: &Path,
+) -> Result<Option<Object>> {
+    let Some(released) = released else {
+        return Ok(None);
+    };
+    let is_argument = |key: &str| released.arguments.iter().any(|keys| keys.contains(&key));
     for folder in ["", "processor"] {
         let path = directory.join(folder).join(PROCESSOR);
         let Some(mut file) = read_object("source", &path)? else {
@@ -138,46 +96,47 @@ fn processor_kwargs(version: Version, directory: &Path) -> Result<Option<Object>
             // Another program's file of this name holds nothing of it.
             None => continue,
         };
-        let released = match version {
-            Version::N16 => "Gr00tN1d6Processor",
-            _ => "Gr00tN1d7Processor",
-        };
         if let Some(class) = file.get("processor_class").filter(|class| !class.is_null())
-            && class != released
+            && class != released.class
         {
             let what = format!(
-                "processor_class: expected {released}, since the tensors are those of {}, got {class}",
-                version.title()
+                "processor_class: expected {}, since the tensors are those of {version}, got {class}",
+                released.class
             );
             return refused(&path, &what);
         }
-        check_keys(&path, "processor_kwargs", &kwargs, &|key| {
-            is_argument(version, key)
-        })?;
+        check_keys(&path, "processor_kwargs", &kwargs, &is_argument)?;
         // What another version calls by this name says nothing here, also where it is false.
-        kwargs.retain(|key, _| is_argument(version, key));
+        kwargs.retain(|key, _| is_argument(key));
         return Ok(Some(kwargs));
     }
     Ok(None)
 }
 
 /// What lerobot's saved steps say. Without them: what lerobot makes of a raw checkpoint.
-fn lerobot(version: Version, directory: &Path) -> Result<Object> {
+fn lerobot_steps(
+    version: Version,
+    rules: &LerobotRules,
+    file: Option<&IsaacFile>,
+    directory: &Path,
+) -> Result<Object> {
     let path = directory.join(PIPELINE);
     let steps = match read_object("source", &path)?.map(|mut file| file.remove("steps")) {
-        None if version == Version::N17 => {
+        None if rules.has_view_sizes => {
             return Ok(as_lerobot_writes(
-                processor_kwargs(version, directory)?.unwrap_or_default(),
+                processor_kwargs(version, file, directory)?.unwrap_or_default(),
             ));
         }
         None => return Ok(Object::new()),
         Some(Some(Value::Array(steps))) => steps,
         Some(_) => return refused(&path, "steps: expected a list"),
     };
-    let mut options = match version {
-        Version::N17 => as_lerobot_writes(Object::new()),
-        _ => Object::new(),
+    let mut options = match rules.has_view_sizes {
+        true => as_lerobot_writes(Object::new()),
+        false => Object::new(),
     };
+    let released = Version::all().filter_map(|version| version.release().lerobot.as_ref());
+    let released: Vec<_> = released.flat_map(|lerobot| lerobot.steps).collect();
     for (index, step) in steps.iter().enumerate() {
         let name = ["registry_name", "class"]
             .iter()
@@ -188,19 +147,18 @@ fn lerobot(version: Version, directory: &Path) -> Result<Object> {
             Some(Value::Object(config)) => config,
             Some(_) => return refused(&path, &format!("steps[{index}].config: expected an object")),
         };
-        let found = STEPS.iter().find(|(known, _)| name == Some(known));
-        let Some((name, keys)) = found else {
+        let Some(step) = released.iter().find(|step| name == Some(step.name)) else {
             let is_off = config.get("enabled") == Some(&Value::Bool(false));
             if is_off || name.is_some_and(|name| OTHER_STEPS.contains(&name)) {
                 continue;
             }
-            let known: Vec<&str> = STEPS.iter().map(|(name, _)| *name).chain(OTHER_STEPS).collect();
+            let known: Vec<&str> = released.iter().map(|step| step.name).chain(OTHER_STEPS).collect();
             let name = name.unwrap_or("a step without a name");
             let what = format!("steps[{index}]: expected one of {}, got {name}", known.join(", "));
             return refused(&path, &what);
         };
-        check_keys(&path, name, config, &|key| keys.contains(&key))?;
-        if *name == N17_ENCODE {
+        check_keys(&path, step.name, config, &|key| step.keys.contains(&key))?;
+        if step.fits_views {
             // Whatever the step leaves out has the default of its class.
             options.extend(object(json!({
                 "crop_fraction": null,
@@ -216,7 +174,7 @@ fn lerobot(version: Version, directory: &Path) -> Result<Object> {
     Ok(options)
 }
 
-/// What lerobot writes into its steps for an NVIDIA checkpoint of N1.7 with these options.
+/// What lerobot writes into its steps for an NVIDIA checkpoint with these options.
 fn as_lerobot_writes(mut kwargs: Object) -> Object {
     // Sizes of a checkpoint count if it has a target.
     if kwargs.get("image_target_size").is_none_or(Value::is_null) {
@@ -230,7 +188,8 @@ fn as_lerobot_writes(mut kwargs: Object) -> Object {
     kwargs
 }
 
-/// That a config has keys only that its release knows. Others are options that cannot be used, like those with a value that cannot.
+/// That a config has keys only that its release knows. Others are options that cannot be used, like those
+/// with a value that cannot.
 fn check_keys(path: &Path, owner: &str, config: &Object, is_known: &dyn Fn(&str) -> bool) -> Result<()> {
     let unknown = config
         .iter()

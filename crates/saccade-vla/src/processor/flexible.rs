@@ -1,4 +1,4 @@
-//! Frames of N1.6 and N1.7: black bars, crops and sizes, and N1.7's patches.
+//! Views as large as their frames make them: black bars, crops, sizes, patches.
 
 use saccade_vla_kernels::{Image, Isa, WeightRounding, resize_area, resize_cubic_u8, resize_linear_u8};
 
@@ -7,53 +7,37 @@ use super::options::MAX_AREA;
 use super::settings::{Flexible, Geometry};
 use crate::alloc::{filled, product};
 use crate::array::OwnedArray;
-use crate::config::Version;
 use crate::error::{Error, Result, problem};
 use crate::ops::check_interrupted;
+use crate::release::{self, Fitting, Pixels};
 
-/// A frame longer than this on one side, by this factor, is refused by the released processors of N1.6 and N1.7.
+/// A frame longer than this on one side, by this factor, is refused by the released processors.
 const MAX_RATIO: usize = 200;
 
-/// The longest side of N1.6's views.
-const N16_MAX_SIDE: f64 = 7000.0;
-
-const N16_FACTOR: usize = 28;
-const N17_PATCH: usize = 16;
-const N17_MERGE: usize = 2;
-const N17_TIME: usize = 2;
-
-/// The view of N1.6 or N1.7 that a frame becomes.
+/// The view that a frame becomes.
 ///
 /// # Errors
 /// [`Error::Input`] for a frame that is too elongated; [`Error::Memory`].
-pub(super) fn flexible_view(
-    version: Version,
-    sizes: &Flexible,
-    isa: Isa,
-    name: &str,
-    frame: Bytes<'_>,
-) -> Result<View> {
+pub(super) fn flexible_view(sizes: &Flexible, isa: Isa, name: &str, frame: Bytes<'_>) -> Result<View> {
     let frame = prepared(sizes, isa, name, frame)?;
     check_ratio(name, frame.height, frame.width)?;
     check_interrupted()?;
-    let (factor, rule) = match version {
-        Version::N17 => (N17_PATCH * N17_MERGE, WeightRounding::Torch),
-        _ => (N16_FACTOR, WeightRounding::Pillow),
+    let rules = sizes.rules;
+    let (height, width) = fitting(sizes, frame.height, frame.width);
+    let pixels = kernel(resize_cubic_u8(isa, frame.image(), height, width, rules.rounding))?;
+    let factor = rules.patch_size * rules.merge;
+    let (pixels, grid) = match rules.pixels {
+        Pixels::Planes => (planes(&pixels, &[1, CHANNELS, height, width])?, None),
+        Pixels::Patches { frames } => {
+            let grid = [1, height / rules.patch_size, width / rules.patch_size];
+            let patches = patches(rules, frames, &pixels, height, width)?;
+            (patches, Some(grid.map(|size| size as i64)))
+        }
     };
-    let (height, width) = fitting(version, sizes, factor, frame.height, frame.width);
-    let pixels = kernel(resize_cubic_u8(isa, frame.image(), height, width, rule))?;
-    let tokens = height * width / (factor * factor);
-    if version == Version::N17 {
-        return Ok(View {
-            pixels: patches(&pixels, height, width)?,
-            tokens,
-            grid: Some([1, (height / N17_PATCH) as i64, (width / N17_PATCH) as i64]),
-        });
-    }
     Ok(View {
-        pixels: planes(&pixels, &[1, CHANNELS, height, width])?,
-        tokens,
-        grid: None,
+        pixels,
+        tokens: height * width / (factor * factor),
+        grid,
     })
 }
 
@@ -195,29 +179,26 @@ fn edge_sizes(edge: usize, height: usize, width: usize) -> (usize, usize) {
     (side(height), side(width))
 }
 
-/// The multiples of `factor` nearest to a frame's sides, between the least and the greatest area.
-pub(super) fn fitting(
-    version: Version,
-    sizes: &Flexible,
-    factor: usize,
-    height: usize,
-    width: usize,
-) -> (usize, usize) {
+/// The height and width of a view, whole tokens: the multiples nearest to the frame's sides, between the
+/// least and the greatest area.
+pub(super) fn fitting(sizes: &Flexible, height: usize, width: usize) -> (usize, usize) {
     let (least, most) = (sizes.min_pixels as f64, sizes.max_pixels as f64);
-    let (height, width, factor) = (height as f64, width as f64, factor as f64);
-    let is_n16 = version == Version::N16;
+    let factor = (sizes.rules.patch_size * sizes.rules.merge) as f64;
+    let (height, width) = (height as f64, width as f64);
     let nearest = |side: f64| {
         let side = (side / factor).round_ties_even() * factor;
-        match is_n16 {
-            true => side.max(factor).min(N16_MAX_SIDE),
-            false => side,
+        match sizes.rules.fitting {
+            Fitting::OfMultiples { max_side } => side.max(factor).min(max_side),
+            Fitting::OfFrame => side,
         }
     };
     let mut fitting = (nearest(height), nearest(width));
     let area = fitting.0 * fitting.1;
     if area > most {
-        // N1.6 goes on from the multiples, N1.7 from the frame.
-        let from = if is_n16 { fitting } else { (height, width) };
+        let from = match sizes.rules.fitting {
+            Fitting::OfMultiples { .. } => fitting,
+            Fitting::OfFrame => (height, width),
+        };
         let shrink = (from.0 * from.1 / most).sqrt();
         let side = |side: f64| ((side / shrink / factor).floor() * factor).max(factor);
         fitting = (side(from.0), side(from.1));
@@ -229,27 +210,37 @@ pub(super) fn fitting(
     (fitting.0 as usize, fitting.1 as usize)
 }
 
-/// N1.7's patches: block by block of 2 x 2, each patch by channel, time, row and column, the frame standing twice along time.
-fn patches(pixels: &[u8], height: usize, width: usize) -> Result<OwnedArray> {
+/// Patches, block by block of `merge x merge`; each by channel, time, row and column, the frame standing
+/// `frames` times along time.
+fn patches(
+    rules: &release::Flexible,
+    frames: usize,
+    pixels: &[u8],
+    height: usize,
+    width: usize,
+) -> Result<OwnedArray> {
     let table = normalized();
-    let (rows, columns) = (height / N17_PATCH, width / N17_PATCH);
-    let plane = N17_PATCH * N17_PATCH;
-    let values = CHANNELS * N17_TIME * plane;
+    let (side, merge) = (rules.patch_size, rules.merge);
+    let (rows, columns) = (height / side, width / side);
+    let plane = side * side;
+    let values = CHANNELS * frames * plane;
     let mut out = filled(PIXELS, product(PIXELS, &[rows, columns, values])?, 0.0)?;
     for (patch, out) in out.chunks_exact_mut(values).enumerate() {
-        let (block, within) = (patch / (N17_MERGE * N17_MERGE), patch % (N17_MERGE * N17_MERGE));
-        let (block_row, block_column) = (block / (columns / N17_MERGE), block % (columns / N17_MERGE));
-        let top = (block_row * N17_MERGE + within / N17_MERGE) * N17_PATCH;
-        let left = (block_column * N17_MERGE + within % N17_MERGE) * N17_PATCH;
-        for (channel, planes) in out.chunks_exact_mut(N17_TIME * plane).enumerate() {
-            let (first, second) = planes.split_at_mut(plane);
-            for (y, out) in first.chunks_exact_mut(N17_PATCH).enumerate() {
-                let line = &pixels[((top + y) * width + left) * CHANNELS..][..N17_PATCH * CHANNELS];
+        let (block, within) = (patch / (merge * merge), patch % (merge * merge));
+        let (block_row, block_column) = (block / (columns / merge), block % (columns / merge));
+        let top = (block_row * merge + within / merge) * side;
+        let left = (block_column * merge + within % merge) * side;
+        for (channel, planes) in out.chunks_exact_mut(frames * plane).enumerate() {
+            let (first, others) = planes.split_at_mut(plane);
+            for (y, out) in first.chunks_exact_mut(side).enumerate() {
+                let line = &pixels[((top + y) * width + left) * CHANNELS..][..side * CHANNELS];
                 for (x, out) in out.iter_mut().enumerate() {
                     *out = table[usize::from(line[x * CHANNELS + channel])];
                 }
             }
-            second.copy_from_slice(first);
+            for other in others.chunks_exact_mut(plane) {
+                other.copy_from_slice(first);
+            }
         }
     }
     OwnedArray::new(out, &[rows * columns, values])

@@ -4,11 +4,12 @@ use std::borrow::Cow;
 
 use saccade_vla_kernels::Image;
 
-use super::settings::{Preprocessing, Settings};
+use super::settings::Settings;
 use crate::alloc::{collected, filled};
 use crate::array::{Array, OwnedArray, first_not_finite};
 use crate::error::{Error, Result, problem, show_shape};
 use crate::ops::refused;
+use crate::release::Preprocessing;
 
 pub(super) const CHANNELS: usize = 3;
 

@@ -17,39 +17,38 @@ use saccade_vla_kernels::Isa;
 
 use crate::alloc::{filled, product, reserve};
 use crate::array::OwnedArray;
-use crate::config::Version;
-use crate::error::{Error, Problem, Result, problem};
+use crate::error::{Error, Result, problem};
+use crate::release::{Pixels, Preprocessing, Version, ViewRules, choice};
 use prompt::{SpecialIds, prompt};
 use settings::{Settings, Sizes};
 use tokenizer::check_length;
 use view::view;
 
 pub use frames::{Frame, View};
-pub use settings::{Preprocessing, ProcessorOptions};
+pub use settings::ProcessorOptions;
 pub use source::ProcessorSource;
 pub use tokenizer::{Tokenizer, TokenizerFiles};
-
-/// Positions that the language model of N1.5 and N1.6 has, and that of N1.7.
-const MAX_POSITIONS: usize = 40_960;
-const N17_MAX_POSITIONS: usize = 262_144;
 
 /// What a robot sees and is told at one time.
 #[derive(Clone, Debug, Default)]
 pub struct Observation<'a> {
     /// The frame of each camera, and the camera's name where it has one.
     pub views: Vec<(Option<&'a str>, Frame<'a>)>,
-    /// Whether the views stand in the order of the prompt, also where the preprocessing would sort them by name.
+    /// Whether the views stand in the order of the prompt, also where the preprocessing would sort them by
+    /// name.
     pub is_ordered: bool,
     /// What the robot is to do. Without it the released default is taken, where there is one.
     pub instruction: Option<&'a str>,
-    /// N1.5: whether the instruction stands in the prompt as it is, even if the processor renders instructions as lists.
+    /// N1.5: whether the instruction stands in the prompt as it is, even if the processor renders
+    /// instructions as lists.
     pub plain_text: bool,
 }
 
 /// Inputs of a backbone, of a batch of observations.
 #[derive(Clone, Debug)]
 pub struct Prepared {
-    /// N1.5: one array `(batch * views, 3, height, width)`. N1.6: an array `(1, 3, height, width)` for each view. N1.7: one array
+    /// N1.5: one array `(batch * views, 3, height, width)`. N1.6: an array `(1, 3, height, width)` for each
+    /// view. N1.7: one array
     /// `(patches, 1536)`.
     pub pixel_values: Vec<OwnedArray>,
     /// The tokens `(batch, length)`, padded on the left.
@@ -75,18 +74,21 @@ pub struct Processor {
 }
 
 impl Processor {
-    /// The processor of `version`: `n1.5`, `n1.6` or `n1.7`.
+    /// The processor of `version`, with the options of a checkpoint.
     ///
     /// # Errors
-    /// [`Error::Input`] for another version and for options that are not the version's, all listed; [`Error::Checkpoint`] for a tokenizer
-    /// without the version's special tokens; [`Error::Isa`] for an unknown instruction set in the environment.
-    pub fn new(version: &str, tokenizer: Tokenizer, options: &ProcessorOptions<'_>) -> Result<Self> {
-        let version = Version::named(version).filter(|version| *version != Version::N1);
-        let version = version.ok_or_else(|| {
-            Error::Input(Problem::new("version", "expected \"n1.5\", \"n1.6\" or \"n1.7\""))
-        })?;
-        let settings = Settings::new(version, options)?;
-        let ids = SpecialIds::find(&tokenizer, version)?;
+    /// [`Error::Input`] for N1, whose frames and words saccade does not prepare, and for options that are not
+    /// the version's, all listed; [`Error::Checkpoint`] for a tokenizer without the version's special tokens;
+    /// [`Error::Isa`] for an unknown instruction set in the environment.
+    pub fn new(version: Version, tokenizer: Tokenizer, options: &ProcessorOptions<'_>) -> Result<Self> {
+        let Some(rules) = &version.release().processor else {
+            let known = choice(Version::all().filter(|version| version.release().processor.is_some()));
+            return Err(Error::Input(
+                problem!("version"; expected "{known}"; got "{:?}", version.name()),
+            ));
+        };
+        let settings = Settings::new(version, rules, options)?;
+        let ids = SpecialIds::find(&tokenizer, version, &rules.prompt)?;
         Ok(Self {
             settings,
             ids,
@@ -95,10 +97,10 @@ impl Processor {
         })
     }
 
-    /// `n1.5`, `n1.6` or `n1.7`.
+    /// The version whose frames and words it prepares.
     #[must_use]
-    pub fn version(&self) -> &'static str {
-        self.settings.version.name()
+    pub fn version(&self) -> Version {
+        self.settings.version
     }
 
     /// Whose frames and words it prepares.
@@ -107,7 +109,8 @@ impl Processor {
         self.settings.preprocessing
     }
 
-    /// Height and width of the views, and their image tokens; none for N1.6 and N1.7, where they depend on the frame.
+    /// Height and width of the views, and their image tokens; none for N1.6 and N1.7, where they depend on
+    /// the frame.
     #[must_use]
     pub fn view_size(&self) -> Option<(usize, usize)> {
         match self.settings.sizes {
@@ -179,8 +182,8 @@ impl Processor {
     /// ```
     ///
     /// # Errors
-    /// [`Error::Shape`] and [`Error::Input`] for frames that are none, for observations with different views, and for an instruction that is too
-    /// long or that changes the number of image tokens; [`Error::Memory`].
+    /// [`Error::Shape`] and [`Error::Input`] for frames that are none, for observations with different views,
+    /// and for an instruction that is too long or that changes the number of image tokens; [`Error::Memory`].
     pub fn process(&self, observations: &[Observation<'_>]) -> Result<Prepared> {
         let orders = self.orders(observations)?;
         let view_names = orders.first().and_then(|order| names(&observations[0], order));
@@ -243,10 +246,7 @@ impl Processor {
 
     /// The ids of a prompt.
     fn prompt_ids(&self, observation: &Observation<'_>, views: &[usize]) -> Result<Vec<u32>> {
-        let most = match self.settings.version {
-            Version::N17 => N17_MAX_POSITIONS,
-            _ => MAX_POSITIONS,
-        };
+        let most = self.settings.rules.max_positions;
         let expected = views
             .iter()
             .fold(0_usize, |sum, tokens| sum.saturating_add(*tokens));
@@ -299,15 +299,15 @@ impl Processor {
 
     /// The views in the arrays that the backbone takes.
     fn joined(&self, views: Vec<View>) -> Result<Vec<OwnedArray>> {
-        if self.settings.version == Version::N16 {
-            return Ok(views.into_iter().map(|view| view.pixels).collect());
-        }
         let Some(first) = views.first() else {
             return Ok(Vec::new());
         };
-        let (rows, mut shape) = match self.settings.version {
-            Version::N15 => (views.len(), [&[0], first.pixels.shape()].concat()),
-            _ => (
+        let (rows, mut shape) = match &self.settings.rules.views {
+            ViewRules::Square { .. } => (views.len(), [&[0], first.pixels.shape()].concat()),
+            ViewRules::Flexible(rules) if rules.pixels == Pixels::Planes => {
+                return Ok(views.into_iter().map(|view| view.pixels).collect());
+            }
+            ViewRules::Flexible(_) => (
                 views.iter().map(|view| view.pixels.shape()[0]).sum(),
                 first.pixels.shape().to_vec(),
             ),

@@ -2,8 +2,9 @@
 
 use serde_json::Value;
 
-use crate::config::{Object, Version};
+use crate::config::Object;
 use crate::error::{Error, Problem, Result, problem};
+use crate::release::{Pixels, Version, ViewRules};
 
 /// Larger sides, and larger areas, are hostile: the greatest area that is published is this one.
 pub(super) const MAX_SIDE: usize = 1 << 12;
@@ -91,52 +92,9 @@ const WITHOUT_EFFECT: [&str; 34] = [
     "vision_feature_select_strategy",
 ];
 
-/// Arguments of the released processors of N1.6 and N1.7: what `processor_kwargs` may hold.
-const KWARGS: [&str; 22] = [
-    "apply_sincos_state_encoding",
-    "clip_outliers",
-    "color_jitter_params",
-    "crop_fraction",
-    "embodiment_id_mapping",
-    "extra_augmentation_config",
-    "formalize_language",
-    "image_crop_size",
-    "image_target_size",
-    "max_action_dim",
-    "max_action_horizon",
-    "max_state_dim",
-    "modality_configs",
-    "model_name",
-    "model_type",
-    "random_rotation_angle",
-    "shortest_image_edge",
-    "statistics",
-    "transformers_loading_kwargs",
-    "use_albumentations",
-    "use_percentiles",
-    "use_relative_action",
-];
-
-/// Those that N1.7's alone has.
-const N17_KWARGS: [&str; 8] = [
-    "exclude_state",
-    "letter_box_transform",
-    "state_dropout_prob",
-    "tactile_embed_dim",
-    "tactile_input_shape",
-    "tactile_state_keys",
-    "use_mean_std",
-    "use_tactile",
-];
-
-/// Whether a key of a released file says something about frames or words of a version.
-pub(super) fn is_read(version: Version, key: &str) -> bool {
-    READ.contains(&key) && (version != Version::N15 || key == "formalize_language")
-}
-
-/// Whether the released processor of N1.6 or N1.7 takes an argument.
-pub(super) fn is_argument(version: Version, key: &str) -> bool {
-    KWARGS.contains(&key) || (version == Version::N17 && N17_KWARGS.contains(&key))
+/// Whether a key of a released file says something about frames or words of a release with these views.
+pub(super) fn is_read(views: &ViewRules, key: &str) -> bool {
+    READ.contains(&key) && (matches!(views, ViewRules::Flexible(_)) || key == "formalize_language")
 }
 
 /// Whether a value asks for nothing: null, false, or empty.
@@ -187,7 +145,8 @@ impl Options {
     /// The keys of a JSON object, those of its `processor_kwargs` beside the others.
     ///
     /// # Errors
-    /// [`Error::Input`] and [`Error::Json`] for what is no object. Keys that are unknown are found by [`finish`](Self::finish).
+    /// [`Error::Input`] and [`Error::Json`] for what is no object. Keys that are unknown are found by
+    /// [`finish`](Self::finish).
     pub(super) fn parse(text: Option<&str>) -> Result<Self> {
         let mut keys = match text.map(serde_json::from_str).transpose() {
             Ok(None) => Object::new(),
@@ -250,8 +209,8 @@ impl Options {
         }
     }
 
-    /// Adds the keys of N1.6 and N1.7 that ask something of N1.5, which has them not.
-    pub(super) fn refuse_later_geometry(&mut self) {
+    /// Adds the keys that ask for what views of one size do not have.
+    pub(super) fn refuse_flexible_geometry(&mut self, version: Version) {
         for key in [
             "image_crop_size",
             "image_target_size",
@@ -260,7 +219,7 @@ impl Options {
             "use_albumentations",
         ] {
             if self.keys.get(key).is_some_and(|value| !asks_for_nothing(value)) {
-                self.differs(key, "none for N1.5");
+                self.differs(key, &format!("none for {version}"));
             }
         }
     }
@@ -367,12 +326,8 @@ impl Options {
         side
     }
 
-    /// The least and the greatest area of a view.
-    pub(super) fn pixel_limits(&mut self, version: Version) -> (usize, usize) {
-        let (least, most) = match version {
-            Version::N17 => (1 << 16, 1 << 24),
-            _ => (4 * 28 * 28, 4096 * 28 * 28),
-        };
+    /// The least and the greatest area of a view; the released ones where no key says them.
+    pub(super) fn pixel_limits(&mut self, (least, most): (usize, usize)) -> (usize, usize) {
         let mut limit = |key: &str, of_size: &str, default: usize| {
             if self.has(key) {
                 return self.count(key, MAX_AREA).unwrap_or(default);
@@ -392,7 +347,7 @@ impl Options {
     }
 
     /// That what is computed in one way only is not asked for in another.
-    pub(super) fn check_released_values(&mut self, version: Version) {
+    pub(super) fn check_released_values(&mut self, views: &ViewRules) {
         let is_half = |value: &Value| match value {
             Value::Array(values) => values.iter().all(|value| value.as_f64() == Some(0.5)),
             value => value.as_f64() == Some(0.5),
@@ -421,10 +376,15 @@ impl Options {
         if self.has("resample") && self.keys["resample"] != 3 {
             self.differs("resample", "3 (cubic)");
         }
-        if version != Version::N17 {
+        let ViewRules::Flexible(rules) = views else { return };
+        let Pixels::Patches { frames } = rules.pixels else {
             return;
-        }
-        for (key, released) in [("patch_size", 16), ("merge_size", 2), ("temporal_patch_size", 2)] {
+        };
+        for (key, released) in [
+            ("patch_size", rules.patch_size),
+            ("merge_size", rules.merge),
+            ("temporal_patch_size", frames),
+        ] {
             if self.has(key) && self.keys[key] != released {
                 self.differs(key, &released.to_string());
             }

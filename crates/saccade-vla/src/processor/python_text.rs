@@ -7,8 +7,8 @@ use std::sync::LazyLock;
 
 use regex::Regex;
 
-/// What `re.sub(r"[^\w\s]", "", text)` removes. `\w` is `str.isalnum` or an underscore; `\s` is `str.isspace`, which has four separators that
-/// Unicode does not count as white space.
+/// What `re.sub(r"[^\w\s]", "", text)` removes. `\w` is `str.isalnum` or an underscore; `\s` is
+/// `str.isspace`, which has four separators that Unicode does not count as white space.
 static PUNCTUATION: LazyLock<Regex> = LazyLock::new(|| pattern(r"[^\p{L}\p{N}_\s\x1c-\x1f]"));
 
 /// What `str.isprintable` denies, and a space.

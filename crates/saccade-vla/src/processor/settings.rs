@@ -1,61 +1,29 @@
 //! How a processor prepares frames and words: by version, by path, and by the options that checkpoints carry.
 
 use super::options::{MAX_AREA, MAX_SIDE, Options};
-use crate::config::Version;
-use crate::error::{Error, Result, problem};
+use crate::error::Result;
+use crate::release::{self, Preprocessing, ProcessorRules, Version, ViewRules, Wording};
 
-/// Whose code a checkpoint was trained behind: it decides how frames are resized and in which order views stand.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Preprocessing {
-    /// lerobot's: views sorted by name.
-    Lerobot,
-    /// Isaac-GR00T's: views in the order given.
-    Isaac,
-}
-
-impl Preprocessing {
-    /// `lerobot` or `isaac`.
-    #[must_use]
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::Lerobot => "lerobot",
-            Self::Isaac => "isaac",
-        }
-    }
-
-    /// The one that goes by this name.
-    ///
-    /// # Errors
-    /// [`Error::Input`] if there is none.
-    pub fn named(name: &str) -> Result<Self> {
-        [Self::Lerobot, Self::Isaac]
-            .into_iter()
-            .find(|one| one.name() == name)
-            .ok_or_else(|| {
-                Error::Input(problem!("preprocessing"; expected "\"lerobot\" or \"isaac\""; got "{name:?}"))
-            })
-    }
-}
-
-/// What a [`Processor`](super::Processor) is made with, besides a version and a tokenizer. None and false leave it to the released processor.
+/// What a [`Processor`](super::Processor) is made with, besides a version and a tokenizer. None and false
+/// leave it to the released processor.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct ProcessorOptions<'a> {
     /// Whose frames and words. By default lerobot's for N1.5, and Isaac-GR00T's for the versions after it.
     pub preprocessing: Option<Preprocessing>,
-    /// Height and width of N1.5's views.
+    /// Height and width of a view, where all have one size.
     pub image_size: Option<usize>,
-    /// Image tokens of one of N1.5's views.
+    /// Image tokens of a view, where all have one size.
     pub tokens_per_view: Option<usize>,
-    /// Whether N1.5's instruction stands in the prompt as it is, and not as a list of one string.
+    /// Whether the instruction stands in the prompt as it is, and not as a list of one string.
     pub plain_text: bool,
     /// Keys of the released `processor_config.json` and `preprocessor_config.json`, as a JSON object.
     pub options: Option<&'a str>,
 }
 
 /// Everything that is decided before the first frame.
-#[derive(Clone, Debug, PartialEq)]
 pub(super) struct Settings {
     pub version: Version,
+    pub rules: &'static ProcessorRules,
     pub preprocessing: Preprocessing,
     pub plain_text: bool,
     pub formalize_language: bool,
@@ -65,20 +33,21 @@ pub(super) struct Settings {
 /// How large a view becomes.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) enum Sizes {
-    /// N1.5: `size x size`, whatever it was.
+    /// `size x size`, whatever the frame was.
     Square {
         size: usize,
         tokens: usize,
         /// Isaac-GR00T's centre crop.
         crop: f64,
     },
-    /// N1.6 and N1.7: as large as the frame makes it.
+    /// As large as the frame makes it.
     Flexible(Flexible),
 }
 
-/// N1.6 and N1.7.
+/// Views as large as the frame makes them.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) struct Flexible {
+    pub rules: &'static release::Flexible,
     /// Black bars make a square of a frame, before anything else.
     pub letter_box: bool,
     pub geometry: Geometry,
@@ -92,11 +61,14 @@ pub(super) struct Flexible {
 pub(super) enum Geometry {
     /// Nothing.
     Untouched,
-    /// With `use_albumentations`: the shorter side to `edge` by area, the centre of `fraction`, the shorter side to `edge` again.
+    /// With `use_albumentations`: the shorter side to `edge` by area, the centre of `fraction`, the shorter
+    /// side to `edge` again.
     Area { edge: usize, fraction: f64 },
-    /// Isaac-GR00T's without `use_albumentations`: linear to `target`, the centre of the size `crop`, linear to `target` again.
+    /// Isaac-GR00T's without `use_albumentations`: linear to `target`, the centre of the size `crop`, linear
+    /// to `target` again.
     Linear { target: [usize; 2], crop: [usize; 2] },
-    /// lerobot's without `use_albumentations`: cubic to a square of `edge`, the centre of `fraction`, cubic to `target`.
+    /// lerobot's without `use_albumentations`: cubic to a square of `edge`, the centre of `fraction`, cubic
+    /// to `target`.
     Cubic {
         edge: usize,
         fraction: f64,
@@ -104,16 +76,11 @@ pub(super) enum Geometry {
     },
 }
 
-/// Sizes of the published N1.5.
-pub(super) const IMAGE_SIZE: usize = 224;
-pub(super) const PATCH_SIZE: usize = 14;
-
 /// The centre that the published checkpoints keep.
 const CROP_FRACTION: f64 = 0.95;
 
-/// The shorter side of a frame of the published checkpoints, and where a file of N1.6 does not name it.
+/// The shorter side of a frame of the published checkpoints.
 const EDGE: usize = 256;
-const N16_EDGE: usize = 512;
 
 /// What lerobot writes for a checkpoint that says nothing.
 pub(super) const LEROBOT_TARGET: [usize; 2] = [256, 256];
@@ -123,25 +90,37 @@ impl Settings {
     /// The settings of a version.
     ///
     /// # Errors
-    /// [`Error::Input`] for an option that is unknown, of the wrong type, or of another version; all are listed.
-    pub(super) fn new(version: Version, given: &ProcessorOptions<'_>) -> Result<Self> {
-        let preprocessing = given.preprocessing.unwrap_or(match version {
-            Version::N15 => Preprocessing::Lerobot,
-            _ => Preprocessing::Isaac,
-        });
+    /// [`Error::Input`] for an option that is unknown, of the wrong type, or of another version; all are
+    /// listed.
+    pub(super) fn new(
+        version: Version,
+        rules: &'static ProcessorRules,
+        given: &ProcessorOptions<'_>,
+    ) -> Result<Self> {
+        let preprocessing = given.preprocessing.unwrap_or(rules.default_preprocessing);
         let mut options = Options::parse(given.options)?;
-        if version == Version::N16 && preprocessing == Preprocessing::Lerobot {
-            options.problem("preprocessing: expected \"isaac\": lerobot has no N1.6".to_owned());
+        if version.release().lerobot.is_none() && preprocessing == Preprocessing::Lerobot {
+            options.problem(format!(
+                "preprocessing: expected \"isaac\": lerobot has no {version}"
+            ));
         }
-        let formalize_language = options.flag("formalize_language", version != Version::N15);
-        let sizes = match version {
-            Version::N15 => square(preprocessing, given, &mut options),
-            _ => flexible(version, preprocessing, given, &mut options),
+        let is_formalized = rules.prompt.wording == Wording::Formalized;
+        let formalize_language = options.flag("formalize_language", is_formalized);
+        let sizes = match &rules.views {
+            ViewRules::Square { size, patch_size } => {
+                options.refuse_flexible_geometry(version);
+                square([*size, *patch_size], preprocessing, given, &mut options)
+            }
+            ViewRules::Flexible(views) => {
+                refuse_sizes(version, given, &mut options);
+                flexible(views, preprocessing, &mut options)
+            }
         };
-        options.check_released_values(version);
+        options.check_released_values(&rules.views);
         options.finish()?;
         Ok(Self {
             version,
+            rules,
             preprocessing,
             plain_text: given.plain_text,
             formalize_language,
@@ -150,12 +129,16 @@ impl Settings {
     }
 }
 
-fn square(preprocessing: Preprocessing, given: &ProcessorOptions<'_>, options: &mut Options) -> Sizes {
-    options.refuse_later_geometry();
+fn square(
+    [image_size, patch_size]: [usize; 2],
+    preprocessing: Preprocessing,
+    given: &ProcessorOptions<'_>,
+    options: &mut Options,
+) -> Sizes {
     let of_file = options.square_size();
-    let size = given.image_size.or(of_file).unwrap_or(IMAGE_SIZE);
+    let size = given.image_size.or(of_file).unwrap_or(image_size);
     let of_file = options.count("tokens_per_tile", MAX_AREA);
-    let published = (size / PATCH_SIZE).pow(2);
+    let published = (size / patch_size).pow(2);
     // The file of a published processor does not know of a smaller image.
     let of_file = of_file.filter(|_| given.image_size.is_none());
     let tokens = given.tokens_per_view.or(of_file).unwrap_or(published);
@@ -173,29 +156,28 @@ fn square(preprocessing: Preprocessing, given: &ProcessorOptions<'_>, options: &
     Sizes::Square { size, tokens, crop }
 }
 
-fn flexible(
-    version: Version,
-    preprocessing: Preprocessing,
-    given: &ProcessorOptions<'_>,
-    options: &mut Options,
-) -> Sizes {
+/// Lists the sizes of views that are given where the frame makes them.
+fn refuse_sizes(version: Version, given: &ProcessorOptions<'_>, options: &mut Options) {
     for (name, value) in [
         ("image_size", given.image_size),
         ("tokens_per_view", given.tokens_per_view),
     ] {
         if let Some(value) = value {
             options.problem(format!(
-                "{name}: expected none for {}, whose views are as large as the frame and the options make them, got {value}",
-                version.title()
+                "{name}: expected none for {version}, whose views are as large as the frame and the options make them, got {value}"
             ));
         }
     }
+}
+
+fn flexible(rules: &'static release::Flexible, preprocessing: Preprocessing, options: &mut Options) -> Sizes {
     let (letter_box, geometry) = match preprocessing {
-        Preprocessing::Isaac => isaac_geometry(version, options),
+        Preprocessing::Isaac => isaac_geometry(rules, options),
         Preprocessing::Lerobot => lerobot_geometry(options),
     };
-    let (min_pixels, max_pixels) = options.pixel_limits(version);
+    let (min_pixels, max_pixels) = options.pixel_limits(rules.areas);
     Sizes::Flexible(Flexible {
+        rules,
         letter_box,
         geometry,
         min_pixels,
@@ -205,18 +187,13 @@ fn flexible(
 
 /// Whether Isaac-GR00T adds black bars, and what it does then.
 ///
-/// Every file of a released processor says `use_albumentations`. With it, a key that is missing has the default of the released constructor.
-/// Options without it are no file, and complete those of the published checkpoints.
-fn isaac_geometry(version: Version, options: &mut Options) -> (bool, Geometry) {
+/// Every file of a released processor says `use_albumentations`. With it, a key that is missing has the
+/// default of the released constructor. Options without it are no file, and complete those of the published
+/// checkpoints.
+fn isaac_geometry(rules: &release::Flexible, options: &mut Options) -> (bool, Geometry) {
     let is_file = options.names("use_albumentations");
-    // N1.6 has no such option: its last release always adds bars, the first one, which made the published checkpoint, did so without
-    // albumentations only.
-    let has_bars = version == Version::N16 && is_file;
-    let letter_box = options.flag("letter_box_transform", has_bars);
-    let edge = match version {
-        Version::N16 if is_file => N16_EDGE,
-        _ => EDGE,
-    };
+    let letter_box = options.flag("letter_box_transform", is_file && rules.file_has_bars);
+    let edge = if is_file { rules.file_edge } else { EDGE };
     let edge = options.side("shortest_image_edge", Some(edge));
     let fraction = options.number("crop_fraction", Some(CROP_FRACTION));
     let target = options.sides("image_target_size", None);

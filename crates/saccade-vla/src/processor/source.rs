@@ -7,52 +7,14 @@ use serde_json::Value;
 
 use super::files::{add_pixel_limits, options, read_object};
 use super::options::overrides;
-use super::settings::{PATCH_SIZE, Preprocessing, ProcessorOptions};
+use super::settings::ProcessorOptions;
 use super::tokenizer::TokenizerFiles;
 use super::{Processor, Tokenizer};
-use crate::config::{CheckpointConfig, Version};
+use crate::backbone::backbones_in;
+use crate::config::{CheckpointConfig, Object};
 use crate::error::{Error, Result, problem, show_shape};
 use crate::recognise::HeadCheckpoint;
-
-/// What the names of a backbone's tensors begin with: lerobot's, NVIDIA's, a backbone alone.
-const PREFIXES: [&str; 3] = ["_groot_model.backbone.", "backbone.", ""];
-
-/// What the names of each version's tensors go on with.
-const MARKS: [(Version, &str); 3] = [
-    (Version::N15, "eagle_model."),
-    (Version::N16, "model.vision_model."),
-    (Version::N17, "model.model.visual."),
-];
-
-/// HeadCheckpoint repositories that have the tokenizer of a version, the released one first, and the files that are needed of it.
-const PUBLISHED: [(Version, &[&str], &[&str]); 3] = [
-    (
-        Version::N15,
-        &["lerobot/eagle2hg-processor-groot-n1p5"],
-        &SLOW_FILES,
-    ),
-    // N1.6's tokenizer has the ids of N1.5's.
-    (
-        Version::N16,
-        &[
-            "aravindhs-NV/eagle3-processor-groot-n1d6",
-            "lerobot/eagle2hg-processor-groot-n1p5",
-        ],
-        &SLOW_FILES,
-    ),
-    (
-        Version::N17,
-        &["nvidia/Cosmos-Reason2-2B", "Qwen/Qwen3-VL-2B-Instruct"],
-        &["tokenizer.json", "preprocessor_config.json"],
-    ),
-];
-
-const SLOW_FILES: [&str; 4] = [
-    "vocab.json",
-    "merges.txt",
-    "added_tokens.json",
-    "tokenizer_config.json",
-];
+use crate::release::{Names, Preprocessing, ProcessorRules, Version, ViewRules};
 
 /// The processor of a checkpoint, before its tokenizer is read.
 pub struct ProcessorSource {
@@ -65,11 +27,13 @@ pub struct ProcessorSource {
 }
 
 impl ProcessorSource {
-    /// Reads what the checkpoint `source` says, one file or a directory. Only headers of its weights are read.
+    /// Reads what the checkpoint `source` says, one file or a directory. Only headers of its weights are
+    /// read.
     ///
     /// # Errors
-    /// [`Error::File`] for files that are not there or broken; [`Error::Json`] and [`Error::Checkpoint`] for a `config.json` that is not, for
-    /// a checkpoint of which no version can be found, and for a config that its tensors contradict.
+    /// [`Error::File`] for files that are not there or broken; [`Error::Json`] and [`Error::Checkpoint`] for
+    /// a `config.json` that is not, for a checkpoint of which no version can be found, and for a config that
+    /// its tensors contradict.
     pub fn open(source: &Path) -> Result<Self> {
         let checkpoint = Checkpoint::open(source)?;
         let directory = match source.is_dir() {
@@ -80,10 +44,13 @@ impl ProcessorSource {
             None => None,
             Some(config) => Some(CheckpointConfig::parse(&Value::Object(config).to_string())?),
         };
-        let found = backbone_of(&checkpoint);
+        let found = {
+            let names: Vec<&str> = checkpoint.names().collect();
+            backbones_in(names.into_iter()).into_iter().next()
+        };
         let version = match found {
-            Some((version, _)) => version,
-            None => version_of_head(source)?,
+            Some((_, version, _)) => version,
+            None => HeadCheckpoint::open(source, None)?.config.version,
         };
         if let Some(config) = &config {
             check_declared(config, version)?;
@@ -92,8 +59,11 @@ impl ProcessorSource {
             || config
                 .as_ref()
                 .is_some_and(|config| config.top().contains_key("type"));
-        let (image_size, tokens_per_view) = match found {
-            Some((Version::N15, prefix)) => n15_sizes(&checkpoint, prefix, config.as_ref())?,
+        let views = version.release().processor.as_ref().map(|rules| &rules.views);
+        let (image_size, tokens_per_view) = match (found, views) {
+            (Some((prefix, _, backbone)), Some(ViewRules::Square { patch_size, .. })) => {
+                square_sizes(&checkpoint, prefix, &backbone.names, *patch_size, config.as_ref())?
+            }
             _ => (None, None),
         };
         let preprocessing = match is_lerobot {
@@ -110,10 +80,10 @@ impl ProcessorSource {
         })
     }
 
-    /// `n1.5`, `n1.6` or `n1.7`.
+    /// The version of the checkpoint.
     #[must_use]
-    pub fn version(&self) -> &'static str {
-        self.version.name()
+    pub fn version(&self) -> Version {
+        self.version
     }
 
     /// The tokenizer that the checkpoint brings along.
@@ -122,29 +92,29 @@ impl ProcessorSource {
         self.tokenizer.as_ref()
     }
 
-    /// HeadCheckpoint repositories that have the tokenizer of this version, the released one first.
+    /// Published repositories that have the tokenizer of this version, the released one first.
     #[must_use]
     pub fn published(&self) -> &'static [&'static str] {
-        self.release().0
+        self.rules().map_or(&[], |rules| rules.tokenizers)
     }
 
     /// The files that are needed of such a repository.
     #[must_use]
     pub fn needed_files(&self) -> &'static [&'static str] {
-        self.release().1
+        self.rules().map_or(&[], |rules| rules.tokenizer_files)
     }
 
-    fn release(&self) -> (&'static [&'static str], &'static [&'static str]) {
-        let found = PUBLISHED.iter().find(|(version, _, _)| *version == self.version);
-        found.map_or((&[], &[]), |(_, ids, files)| (*ids, *files))
+    fn rules(&self) -> Option<&'static ProcessorRules> {
+        self.version.release().processor.as_ref()
     }
 
-    /// The processor, with these files or the checkpoint's own, and with this path or the checkpoint's own. `replaced` is a JSON object of
-    /// options that take the place of the checkpoint's.
+    /// The processor, with these files or the checkpoint's own, and with this path or the checkpoint's own.
+    /// `replaced` is a JSON object of options that take the place of the checkpoint's.
     ///
     /// # Errors
-    /// [`Error::Checkpoint`] if no tokenizer is given and the checkpoint has none, and for files of the processor that are broken or hold what
-    /// their release does not know; those of reading a [`TokenizerFiles`] and [`Processor::new`].
+    /// [`Error::Checkpoint`] if no tokenizer is given and the checkpoint has none, and for files of the
+    /// processor that are broken or hold what their release does not know; those of reading a
+    /// [`TokenizerFiles`] and [`Processor::new`].
     pub fn processor(
         &self,
         tokenizer: Option<&TokenizerFiles>,
@@ -158,14 +128,17 @@ impl ProcessorSource {
             ))
         })?;
         let preprocessing = preprocessing.unwrap_or(self.preprocessing);
-        let mut options = options(self.version, preprocessing, &self.directory)?;
-        if self.version == Version::N17 {
-            add_pixel_limits(&mut options, files.folder())?;
+        let mut found = Object::new();
+        if let Some(rules) = self.rules() {
+            found = options(self.version, rules, preprocessing, &self.directory)?;
+            if rules.has_pixel_limits() {
+                add_pixel_limits(&mut found, files.folder())?;
+            }
         }
         if let Some(replaced) = replaced {
-            options.extend(overrides(replaced)?);
+            found.extend(overrides(replaced)?);
         }
-        let options = Value::Object(options).to_string();
+        let options = Value::Object(found).to_string();
         let given = ProcessorOptions {
             preprocessing: Some(preprocessing),
             image_size: self.image_size,
@@ -173,65 +146,41 @@ impl ProcessorSource {
             plain_text: false,
             options: Some(&options),
         };
-        Processor::new(self.version.name(), Tokenizer::read(files)?, &given)
+        Processor::new(self.version, Tokenizer::read(files)?, &given)
     }
 }
 
-/// The version of the backbone in a checkpoint, and its prefix.
-fn backbone_of(checkpoint: &Checkpoint) -> Option<(Version, &'static str)> {
-    let starts = |prefix: &str, mark: &str| {
-        let start = format!("{prefix}{mark}");
-        checkpoint.names().any(|name| name.starts_with(&start))
-    };
-    let all = PREFIXES.iter().flat_map(|prefix| {
-        MARKS
-            .iter()
-            .map(move |(version, mark)| (*version, *prefix, *mark))
-    });
-    let mut found = all.filter(|(_, prefix, mark)| starts(prefix, mark));
-    found.next().map(|(version, prefix, _)| (version, prefix))
-}
-
-/// The version of a checkpoint without a backbone that is known.
-fn version_of_head(source: &Path) -> Result<Version> {
-    let head = HeadCheckpoint::open(source, None)?;
-    Version::named(&head.config.version).ok_or_else(|| {
-        Error::Checkpoint(problem!(
-            "source"; expected "the backbone of GR00T N1.5, N1.6 or N1.7";
-            got "a head of {}", head.config.version
-        ))
-    })
-}
-
-/// That the config names no other version than the tensors.
+/// Refuses a config that names another version than the tensors.
 fn check_declared(config: &CheckpointConfig, version: Version) -> Result<()> {
     for declared in config.declared() {
         if declared.version.is_some_and(|other| other != version) {
             return Err(Error::Checkpoint(problem!(
-                "config"; "{}, but the tensors are those of {}", declared.text, version.title()
+                "config"; "{}, but the tensors are those of {version}", declared.text
             )));
         }
     }
     Ok(())
 }
 
-/// Side and tokens of N1.5's views, from the shapes of the vision tower and of the connector.
-fn n15_sizes(
+/// Side and tokens of views of one size, from the shapes of the vision tower and of the connector.
+fn square_sizes(
     checkpoint: &Checkpoint,
     prefix: &str,
+    names: &Names,
+    patch_size: usize,
     config: Option<&CheckpointConfig>,
 ) -> Result<(Option<usize>, Option<usize>)> {
     let shape = |name: &str| {
-        let name = format!("{prefix}eagle_model.{name}");
+        let name = format!("{prefix}{name}");
         checkpoint.shape(&name).map(|shape| (name, shape))
     };
-    let embeddings = "vision_model.vision_model.embeddings";
+    let embeddings = format!("{}.embeddings", names.vision);
     let Some((name, positions)) = shape(&format!("{embeddings}.position_embedding.weight")) else {
         return Ok((None, None));
     };
     let patch = match shape(&format!("{embeddings}.patch_embedding.weight")) {
         Some((_, &[_, _, side, _])) => side,
-        _ => PATCH_SIZE,
+        _ => patch_size,
     };
     let bad = |what: &str| {
         Err(Error::Checkpoint(problem!(
@@ -246,7 +195,7 @@ fn n15_sizes(
         return bad("a square of patches");
     }
     // A connector that is wider takes several patches at once.
-    let taken = match shape("mlp1.0.weight") {
+    let taken = match shape(&format!("{}.0.weight", names.connector.unwrap_or_default())) {
         Some((_, &[inputs] | &[_, inputs])) if inputs.is_multiple_of(width) => (inputs / width).max(1),
         _ => 1,
     };

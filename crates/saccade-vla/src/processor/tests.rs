@@ -7,8 +7,8 @@ use saccade_vla_kernels::{Image, Isa};
 
 use super::flexible::{fitting, prepared};
 use super::frames::Bytes;
-use super::settings::{Flexible, Preprocessing, ProcessorOptions, Settings, Sizes};
-use crate::config::Version;
+use super::settings::{Flexible, ProcessorOptions, Settings, Sizes};
+use crate::release::{Preprocessing, Version};
 
 /// A `(height, width, 3)` array of bytes of a fixture.
 fn bytes(checkpoint: &Checkpoint, name: &str) -> Bytes<'static> {
@@ -23,15 +23,16 @@ fn bytes(checkpoint: &Checkpoint, name: &str) -> Bytes<'static> {
     Bytes::new(pixels, shape[0], shape[1])
 }
 
-fn sizes_of(preprocessing: Preprocessing, options: &str) -> Flexible {
+fn sizes_of(version: Version, preprocessing: Preprocessing, options: &str) -> Flexible {
     let given = ProcessorOptions {
         preprocessing: Some(preprocessing),
         options: Some(options),
         ..ProcessorOptions::default()
     };
-    match Settings::new(Version::N17, &given).unwrap().sizes {
+    let rules = version.release().processor.as_ref().unwrap();
+    match Settings::new(version, rules, &given).unwrap().sizes {
         Sizes::Flexible(sizes) => sizes,
-        Sizes::Square { .. } => panic!("the views of N1.7 have no fixed size"),
+        Sizes::Square { .. } => panic!("the views of {version} have no fixed size"),
     }
 }
 
@@ -46,7 +47,7 @@ fn frames_before_the_last_resize() {
         ("albumentations_95", Preprocessing::Isaac, isaac),
         ("lerobot_albumentations_58", Preprocessing::Lerobot, lerobot),
     ] {
-        let sizes = sizes_of(preprocessing, options);
+        let sizes = sizes_of(Version::N17, preprocessing, options);
         for sample in 0..7 {
             for isa in Isa::available() {
                 let raw = bytes(&checkpoint, &format!("{sample}.raw"));
@@ -65,23 +66,19 @@ fn frames_before_the_last_resize() {
 
 #[test]
 fn sizes_of_views_are_multiples_within_limits() {
-    let sizes = sizes_of(Preprocessing::Isaac, "{}");
-    for (version, factor, frame, view) in [
-        (Version::N17, 32, (256, 256), (256, 256)),
-        (Version::N17, 32, (256, 341), (256, 352)),
+    for (version, frame, view) in [
+        (Version::N17, (256, 256), (256, 256)),
+        (Version::N17, (256, 341), (256, 352)),
         // Half to even, as Python rounds: 5.5 and 6.5 become 6.
-        (Version::N17, 32, (176 * 2, 208 * 2), (352, 416)),
-        (Version::N17, 32, (10, 10), (256, 256)),
-        (Version::N17, 32, (10_000, 10_000), (4096, 4096)),
-        (Version::N16, 28, (256, 256), (252, 252)),
-        (Version::N16, 28, (10_000, 10_000), (1792, 1792)),
+        (Version::N17, (176 * 2, 208 * 2), (352, 416)),
+        (Version::N17, (10, 10), (256, 256)),
+        (Version::N17, (10_000, 10_000), (4096, 4096)),
+        (Version::N16, (256, 256), (252, 252)),
+        (Version::N16, (10_000, 10_000), (1792, 1792)),
     ] {
-        let mut sizes = sizes.clone();
-        if version == Version::N16 {
-            (sizes.min_pixels, sizes.max_pixels) = (4 * 784, 4096 * 784);
-        }
+        let sizes = sizes_of(version, Preprocessing::Isaac, "{}");
         let (height, width) = frame;
-        assert_eq!(fitting(version, &sizes, factor, height, width), view, "{frame:?}");
+        assert_eq!(fitting(&sizes, height, width), view, "{version}: {frame:?}");
     }
 }
 

@@ -4,9 +4,10 @@ use saccade_vla_kernels::{Isa, WeightRounding, resize_cubic_u8, resize_linear_f3
 
 use super::flexible::flexible_view;
 use super::frames::{CHANNELS, Frame, View, crop_half_to_even, kernel, planes, read};
-use super::settings::{Preprocessing, Settings, Sizes};
+use super::settings::{Settings, Sizes};
 use crate::error::Result;
 use crate::ops::check_interrupted;
+use crate::release::Preprocessing;
 
 /// The view that a frame becomes, which errors call `name`.
 ///
@@ -37,6 +38,6 @@ pub(super) fn view(settings: &Settings, isa: Isa, name: &str, frame: Frame<'_>) 
                 grid: None,
             })
         }
-        Sizes::Flexible(sizes) => flexible_view(settings.version, sizes, isa, name, bytes),
+        Sizes::Flexible(sizes) => flexible_view(sizes, isa, name, bytes),
     }
 }

@@ -4,13 +4,14 @@ use serde_json::Value;
 
 use super::layout::{CheckpointLayout, Contents, Evidence};
 use super::sizes::{DECODERS, FUTURE_TOKENS};
-use crate::config::{Feature, Version};
 use crate::error::{Error, Result, problem};
+use crate::release::{Feature, Version};
 
 /// The one version that all evidence fits, and the evidence, a sentence each.
 ///
 /// # Errors
-/// [`Error::Checkpoint`] for evidence that contradicts itself, and for names of GR00T models that are unknown.
+/// [`Error::Checkpoint`] for evidence that contradicts itself, and for names of GR00T models that are
+/// unknown.
 pub(super) fn recognise_version(
     contents: &Contents<'_>,
     layout: &dyn CheckpointLayout,
@@ -19,7 +20,7 @@ pub(super) fn recognise_version(
     let fits = |version: &Version| found.iter().all(|one| one.versions.contains(version));
     let possible: Vec<Version> = Version::all().filter(fits).collect();
     let sentences = found.iter().map(|one| {
-        let versions: Vec<String> = one.versions.iter().copied().map(Version::title).collect();
+        let versions: Vec<String> = one.versions.iter().map(Version::to_string).collect();
         format!("{}: {}", one.what, versions.join(" or "))
     });
     let version = match possible[..] {
@@ -39,7 +40,7 @@ pub(super) fn recognise_version(
     Ok((version, sentences.collect()))
 }
 
-/// The version that a head of these keys and tensors usually has.
+/// The version that a head of these keys and tensors usually has, if nothing names it.
 fn usual_version(contents: &Contents<'_>) -> Version {
     let (config, tensors) = (contents.config, &contents.tensors);
     let is_flat = config.get("max_action_dim").is_some() && config.get("action_dim").is_none();

@@ -1,10 +1,16 @@
-//! What a layout of checkpoints is: who writes them, where the head is in them, and where its sizes come from.
+//! What a layout of checkpoints is: who writes them, where the head is in them, and where its sizes come
+//! from.
 
 use std::path::Path;
 
 use super::sizes::{self, HeadShapes};
-use crate::config::{CheckpointConfig, Object, Version};
+use crate::config::{CheckpointConfig, Object};
 use crate::error::Result;
+use crate::release::Version;
+
+/// The beginnings of the names of a backbone's tensors: in lerobot's checkpoints, in NVIDIA's, and of a
+/// backbone alone.
+pub(crate) const BACKBONE_PREFIXES: [&str; 3] = ["_groot_model.backbone.", "backbone.", ""];
 
 /// What is known about a checkpoint before its version is recognised.
 pub(super) struct Contents<'a> {
@@ -47,7 +53,8 @@ pub(super) trait CheckpointLayout: Sync {
     /// The head's config in the released keys, and everything that it and the tensors disagree on.
     ///
     /// # Errors
-    /// [`Error::Checkpoint`](crate::Error::Checkpoint) if there is no head's config, and the tensors do not make one.
+    /// [`Error::Checkpoint`](crate::Error::Checkpoint) if there is no head's config, and the tensors do not
+    /// make one.
     fn head_config(&self, contents: &Contents<'_>, version: Version) -> Result<(Object, Vec<String>)> {
         Ok(sizes::complete(
             contents.config.head(),

@@ -1,5 +1,5 @@
-//! lerobot's checkpoints, whose `config.json` describes a policy and holds no size of the head. Sizes come from the tensors; what no shape
-//! determines is taken from the published models.
+//! lerobot's checkpoints, whose `config.json` describes a policy and holds no size of the head. Sizes come
+//! from the tensors; what no shape determines is taken from the published models.
 
 use std::path::Path;
 
@@ -8,8 +8,9 @@ use serde_json::{Map, Value, json};
 
 use super::layout::{CheckpointLayout, Contents, Evidence};
 use super::sizes::{self, BLOCKS, FUTURE_TOKENS, HeadShapes, add_decoders, proved};
-use crate::config::{CheckpointConfig, Feature, OWN_KEY, Object, Version};
+use crate::config::{CheckpointConfig, OWN_KEY, Object};
 use crate::error::{Error, Result, problem};
+use crate::release::{Feature, Version};
 
 /// lerobot's: everything under `_groot_model.`, the policy's `config.json`.
 pub(super) struct Lerobot;
@@ -21,9 +22,6 @@ const PREFIX: &str = "_groot_model.action_head.";
 
 /// `type` in lerobot's `config.json` of a GR00T policy.
 const POLICY: &str = "groot";
-
-/// The versions that lerobot reads.
-const VERSIONS: [Version; 2] = [Version::N15, Version::N17];
 
 impl CheckpointLayout for Lerobot {
     fn name(&self) -> &'static str {
@@ -54,7 +52,9 @@ impl CheckpointLayout for Lerobot {
             return;
         }
         found.push(Evidence {
-            versions: VERSIONS.to_vec(),
+            versions: Version::all()
+                .filter(|version| version.release().lerobot.is_some())
+                .collect(),
             what: format!("config.json is lerobot's, type \"{POLICY}\""),
         });
         if let Some(Value::String(base)) = contents.config.top().get("base_model_path")
@@ -109,19 +109,13 @@ impl CheckpointLayout for Fork {
 const DIT_HEAD_DIM: usize = 48;
 const VL_HEAD_DIM: usize = 64;
 
-/// Actions that a model denoises. lerobot keeps the number of the model that a policy was made from, and nothing that it saves holds it:
-/// `chunk_size`, and the `action_horizon` of its processors (which may be `chunk_size` again, or the most that Isaac-GR00T's processor
-/// takes), say what is trained and cut, not what is denoised. These are the published models'; a fine-tune by Isaac-GR00T keeps them too,
-/// since its trainer takes the model's config from where it starts.
-const N15_HORIZON: u64 = 16;
-const N17_HORIZON: u64 = 40;
-
-/// The head's config where the file holds none of it: sizes from the tensors, the rest as the published models of that version have it.
+/// The head's config where the file holds none of it: sizes from the tensors, the rest as the published
+/// models of that version have it.
 fn from_tensors(policy: &Object, version: Version, tensors: &HeadShapes<'_>) -> Result<Object> {
     let number = |key: &str| policy.get(key).and_then(Value::as_u64);
     let sizes = proved(version, tensors);
     let mut head = Map::new();
-    head.insert("model_type".to_owned(), json!(version.model_type()));
+    head.insert("model_type".to_owned(), json!(version.release().model_type));
     for (key, size, _) in &sizes {
         head.insert((*key).to_owned(), json!(size));
     }
@@ -135,15 +129,16 @@ fn from_tensors(policy: &Object, version: Version, tensors: &HeadShapes<'_>) -> 
     set("num_timestep_buckets", json!(1000));
     let steps = number("num_inference_timesteps").unwrap_or(4);
     set("num_inference_timesteps", json!(steps));
+    if let Some(lerobot) = &version.release().lerobot {
+        set("action_horizon", json!(lerobot.action_horizon));
+    }
     if version.is_flat() {
         set("use_alternate_vl_dit", json!(true));
         set("attend_text_every_n_blocks", json!(2));
         set("state_history_length", json!(state.history));
-        set("action_horizon", json!(N17_HORIZON));
     } else {
         let tokens = tensors.size(FUTURE_TOKENS, 2, 0).unwrap_or(0);
         set("num_target_vision_tokens", json!(tokens));
-        set("action_horizon", json!(N15_HORIZON));
     }
     add_decoders(&mut head, tensors);
     let action_dim = number("max_action_dim").map(|dim| widened(version, dim, 32));
@@ -169,7 +164,7 @@ fn from_tensors(policy: &Object, version: Version, tensors: &HeadShapes<'_>) -> 
         "source";
         "config.json (lerobot's, GR00T {}) and tensors do not make a head; the head's own config can be given as \
          `config`:\n  {}",
-        version.title(), problems.join("\n  ")
+        version, problems.join("\n  ")
     )))
 }
 
@@ -199,7 +194,7 @@ fn add_transformers(
             problems.push(format!(
                 "{what} is {width}: not a multiple of {head_dim}, the width of an attention head in GR00T {}; lerobot's config.json \
                  does not say how wide they are here",
-                version.title()
+                version
             ));
         }
         width / head_dim
@@ -218,7 +213,7 @@ fn add_transformers(
         dit["cross_attention_dim"] = json!(context);
     }
     let vl_layers = tensors.blocks(vl_blocks);
-    if vl_layers > 0 || version == Version::N15 {
+    if vl_layers > 0 || !version.is_flat() {
         let vl = json!({
             "attention_head_dim": VL_HEAD_DIM,
             "num_attention_heads": heads("backbone_embedding_dim", context, VL_HEAD_DIM),
@@ -255,15 +250,18 @@ fn state_sizes(policy: &Object, version: Version, tensors: &HeadShapes<'_>) -> S
     }
 }
 
-/// The width that lerobot pads to for N1.7, whose policies may still have the `default` of N1.5 in their config.
+/// The width that lerobot pads to, where a policy's config may still have the `default` of N1.5.
 fn widened(version: Version, dim: u64, default: u64) -> u64 {
-    match version {
-        Version::N17 if dim == default => 132,
-        _ => dim,
-    }
+    let padded_to = version
+        .release()
+        .lerobot
+        .as_ref()
+        .and_then(|lerobot| lerobot.padded_to);
+    padded_to.filter(|_| dim == default).unwrap_or(dim)
 }
 
-/// Saccade's own part of the head's config: in a separate file, since lerobot refuses a `config.json` with keys that it does not know.
+/// Saccade's own part of the head's config: in a separate file, since lerobot refuses a `config.json` with
+/// keys that it does not know.
 fn own_config(directory: &Path) -> Result<Option<Value>> {
     let path = directory.join(OWN_CONFIG);
     if !path.exists() {

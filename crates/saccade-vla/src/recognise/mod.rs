@@ -1,7 +1,9 @@
-//! What a checkpoint is: its layout, the version of the architecture, and the head's whole config, from `config.json` and from the tensors.
+//! What a checkpoint is: its layout, the version of the architecture, and the head's whole config, from
+//! `config.json` and from the tensors.
 //!
-//! Every command and [`ActionHead::load`](crate::ActionHead::load) start here. Sizes that published configs leave out are taken from the
-//! shapes of the tensors. Where config and tensors disagree, one error lists everything.
+//! Every command and [`ActionHead::load`](crate::ActionHead::load) start here. Sizes that published configs
+//! leave out are taken from the shapes of the tensors. Where config and tensors disagree, one error lists
+//! everything.
 
 mod evidence;
 mod layout;
@@ -17,6 +19,7 @@ use serde_json::Value;
 use crate::config::{CheckpointConfig, HeadConfig};
 use crate::error::{Error, Result, problem};
 use evidence::recognise_version;
+pub(crate) use layout::BACKBONE_PREFIXES;
 use layout::{CheckpointLayout, Contents};
 use lerobot::{Fork, Lerobot};
 use nvidia::{IsaacFineTune, Nvidia, Own};
@@ -28,8 +31,8 @@ pub struct HeadCheckpoint {
     pub checkpoint: Checkpoint,
     /// What the names of the head's tensors begin with.
     pub prefix: &'static str,
-    /// Who wrote it: `nvidia`, `isaac` (Isaac-GR00T's trainer), `lerobot`, `fork` (lerobot's, with several action decoders) or `saccade` (a
-    /// head alone).
+    /// Who wrote it: `nvidia`, `isaac` (Isaac-GR00T's trainer), `lerobot`, `fork` (lerobot's, with several
+    /// action decoders) or `saccade` (a head alone).
     pub layout: &'static str,
     /// The head's sizes and switches.
     pub config: HeadConfig,
@@ -42,13 +45,14 @@ pub struct HeadCheckpoint {
 }
 
 impl HeadCheckpoint {
-    /// Opens `source`, one `.safetensors` file or a directory of them, with `config`, as JSON, or the `config.json` next to the weights.
+    /// Opens `source`, one `.safetensors` file or a directory of them, with `config`, as JSON, or the
+    /// `config.json` next to the weights.
     ///
     /// The names and shapes of single tensors are checked where they are read.
     ///
     /// # Errors
-    /// [`Error::File`] for a path or a config that is not there and for broken files; [`Error::Checkpoint`] for a config that is not one, and
-    /// for everything that config and tensors disagree on, in one list.
+    /// [`Error::File`] for a path or a config that is not there and for broken files; [`Error::Checkpoint`]
+    /// for a config that is not one, and for everything that config and tensors disagree on, in one list.
     pub fn open(source: &Path, config: Option<&str>) -> Result<Self> {
         Self::of(Checkpoint::open(source)?, source, config)
     }
@@ -87,7 +91,7 @@ impl HeadCheckpoint {
         if !problems.is_empty() {
             return Err(Error::Checkpoint(problem!(
                 "source"; "config and tensors disagree (GR00T {}):\n  {}",
-                version.title(), problems.join("\n  ")
+                version, problems.join("\n  ")
             )));
         }
         Ok(Self {
@@ -101,7 +105,8 @@ impl HeadCheckpoint {
         })
     }
 
-    /// All tensors of the checkpoint, sorted by name; without those that are in two files, which [`HeadCheckpoint::check`] refuses in a head.
+    /// All tensors of the checkpoint, sorted by name; without those that are in two files, which
+    /// [`HeadCheckpoint::check`] refuses in a head.
     pub fn tensors(&self) -> impl Iterator<Item = TensorFacts> {
         let checkpoint = &self.checkpoint;
         checkpoint.names().filter_map(|name| {
@@ -164,9 +169,6 @@ fn has_head_config(config: &CheckpointConfig) -> Result<bool> {
     Ok(true)
 }
 
-/// What the names of the tensors of a backbone begin with, in the layouts that name them so.
-const BACKBONES: [&str; 2] = ["backbone.", "_groot_model.backbone."];
-
 /// What the names of the head's tensors begin with: empty if no layout's prefix is used.
 ///
 /// # Errors
@@ -180,7 +182,10 @@ fn head_prefix(checkpoint: &Checkpoint) -> Result<&'static str> {
     }
     match used[..] {
         [] => {
-            let is_backbone = |name: &str| BACKBONES.iter().any(|prefix| name.starts_with(prefix));
+            let is_backbone = |name: &str| {
+                let mut prefixes = BACKBONE_PREFIXES.iter().filter(|prefix| !prefix.is_empty());
+                prefixes.any(|prefix| name.starts_with(prefix))
+            };
             match checkpoint.names().next() {
                 Some(first) if checkpoint.names().all(is_backbone) => Err(Error::Checkpoint(problem!(
                     "source";

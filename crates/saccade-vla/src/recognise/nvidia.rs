@@ -1,4 +1,5 @@
-//! NVIDIA's checkpoints, as published and as Isaac-GR00T's trainer writes them, and heads alone, as saccade writes them.
+//! NVIDIA's checkpoints, as published and as Isaac-GR00T's trainer writes them, and heads alone, as saccade
+//! writes them.
 
 use super::layout::{CheckpointLayout, Contents};
 

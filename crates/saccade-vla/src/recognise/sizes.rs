@@ -3,8 +3,9 @@
 use saccade_vla_checkpoint::Checkpoint;
 use serde_json::{Value, json};
 
-use crate::config::{Feature, Object, Version};
+use crate::config::Object;
 use crate::error::show_shape;
+use crate::release::{Feature, Version};
 
 /// The name, without a prefix, of the future tokens.
 pub(crate) const FUTURE_TOKENS: &str = "future_tokens.weight";
@@ -111,7 +112,7 @@ pub(super) const DECODERS: [(&str, &str); 4] = [
 /// The head's config with what tensors prove and the published file leaves out, and where the two disagree.
 pub(super) fn complete(head: &Object, version: Version, tensors: &HeadShapes<'_>) -> (Object, Vec<String>) {
     let mut head = head.clone();
-    head.insert("model_type".to_owned(), json!(version.model_type()));
+    head.insert("model_type".to_owned(), json!(version.release().model_type));
     if version.has(Feature::FutureTokens) && !tensors.any("future_tokens.") {
         // The first files of N1.5 were without.
         head.entry("num_target_vision_tokens").or_insert(json!(0));
@@ -167,7 +168,8 @@ pub(super) const BLOCKS: [(&str, &str); 2] = [
     ("vl_self_attention_cfg", "vl_self_attention.transformer_blocks"),
 ];
 
-/// The fork's keys, where its decoders are there and the file does not name them: its code makes them up while it loads.
+/// The fork's keys, where its decoders are there and the file does not name them: its code makes them up
+/// while it loads.
 pub(super) fn add_decoders(head: &mut Object, tensors: &HeadShapes<'_>) {
     let widths = DECODERS.iter().filter_map(|(name, _)| tensors.decoder(name));
     // Shapes of tensors without elements may be anything.

@@ -122,9 +122,9 @@ pub fn convert(
         report.embodiment_ids = Some(ids);
     }
     let specs = tensor_specs(&source.config)?;
-    let per_embodiment: BTreeSet<String> = specs
+    let stacked: BTreeSet<String> = specs
         .iter()
-        .filter(|spec| spec.per_embodiment)
+        .filter(|spec| spec.is_stacked)
         .map(|spec| format!("{}{}", source.prefix, spec.name))
         .collect();
     let planned = plan(&source, options, &mut report)?;
@@ -135,7 +135,7 @@ pub fn convert(
         let mut tensor = Changed::new(&source, name, options, adapter.as_ref())?;
         let nbytes = tensor.nbytes()?;
         let slices = match &kept {
-            Some(kept) if per_embodiment.contains(name) => {
+            Some(kept) if stacked.contains(name) => {
                 let slice = nbytes / source.config.num_embodiments as u64;
                 let ids = 0..source.config.num_embodiments;
                 ids.map(|id| (kept.contains(&id), slice)).collect()

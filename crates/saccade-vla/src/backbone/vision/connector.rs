@@ -6,7 +6,6 @@
 use saccade_vla_kernels::{Epilogue, Rows, RowsMut};
 
 use crate::alloc::{Scratch, filled, product};
-use crate::backbone::config::PatchOrder;
 use crate::engine::Kernels;
 use crate::error::Result;
 use crate::nn::linear::Linear;
@@ -14,6 +13,7 @@ use crate::nn::norm::LayerNorm;
 use crate::nn::weights::Weights;
 use crate::precision::Role;
 use crate::profile::Part;
+use crate::release::PatchOrder;
 
 /// `linear2(gelu(linear1(norm(x))))`, or one linear layer alone.
 pub(super) struct Connector {

@@ -19,12 +19,12 @@ pub(super) use self::tower::VisionWorkspace;
 use super::config::{BackboneConfig, Tower};
 use super::features::View;
 use super::inputs::{ViewPixels, num_tokens};
-use super::released::Names;
 use crate::alloc::{collected, copied, reserve};
 use crate::engine::Kernels;
 use crate::error::Result;
 use crate::nn::weights::Weights;
 use crate::ops::check_interrupted;
+use crate::release::Names;
 
 /// Patches that are encoded together. More read the weights less often; fewer keep the activations small: at
 /// 2048 patches the weights are read once for 8 views, and the largest buffer is 35 MB at N1.5's size.

@@ -8,9 +8,8 @@ use super::positions::{Taps, antialiased, interpolate};
 use super::tower::{TokensWorkspace, VisionTower};
 use crate::alloc::Scratch;
 use crate::array::OwnedArray;
-use crate::backbone::config::{BackboneConfig, CHANNELS, PatchOrder, PixelOrder, VisionConfig};
+use crate::backbone::config::{BackboneConfig, CHANNELS, VisionConfig};
 use crate::backbone::inputs::ViewPixels;
-use crate::backbone::released::Names;
 use crate::engine::Kernels;
 use crate::error::Result;
 use crate::nn::grouped_attention::{Projections, Qkv};
@@ -21,6 +20,8 @@ use crate::nn::weights::Weights;
 use crate::ops::check_interrupted;
 use crate::precision::Role;
 use crate::profile::Part;
+use crate::release::Names;
+use crate::release::{PatchOrder, PixelOrder};
 
 const BLOCK: BlockNames = BlockNames {
     norms: ["layer_norm1", "layer_norm2"],

@@ -5,8 +5,9 @@ use std::ops::Range;
 use serde_json::Value;
 use serde_json::value::RawValue;
 
-use crate::config::{Feature, HEAD_KEY, HeadConfig, OWN_KEY, Version};
+use crate::config::{HEAD_KEY, HeadConfig, OWN_KEY};
 use crate::error::{Error, Problem, Result, problem};
+use crate::release::Feature;
 use crate::rewrite::json_edit::{Found, entry, find, span};
 
 /// Merging compares every token with every other, and a chunk takes time in proportion to their number.
@@ -56,13 +57,12 @@ struct HeadObject {
 pub(super) fn config_edit(config: &HeadConfig, given: &str, count: usize) -> Result<ConfigEdit> {
     let bad = |argument, problem: String| Err(Error::Checkpoint(Problem::new(argument, problem)));
     let before = config.num_future_tokens;
-    let version = Version::named(&config.version);
-    if !version.is_some_and(|version| version.has(Feature::FutureTokens)) {
+    if !config.version.has(Feature::FutureTokens) {
         return bad(
             "source",
             format!(
                 "GR00T {} has no future tokens, so there is no number of them to change",
-                config.version.to_uppercase()
+                config.version
             ),
         );
     }
