@@ -185,7 +185,7 @@ def run_rust_tests(session: nox.Session) -> None:
     Benches have no tests, and their dependencies are slow to build.
     """
     cargo(session, "test", "--locked", "--quiet")
-    for example in ("sample", "look_inside"):
+    for example in ("sample", "look_inside", "act"):
         command = ("run", "--locked", "--quiet", "--package", "saccade-vla", "--example", example)
         session.run("cargo", *command, silent=True, external=True)
 

@@ -14,6 +14,8 @@ _Bytes = npt.NDArray[np.uint8]  # of a mask: 0 is False
 _Int64 = npt.NDArray[np.int64]
 _Float64 = npt.NDArray[np.float64]
 _Frame = npt.NDArray[np.uint8] | npt.NDArray[np.float32] | npt.NDArray[np.float64]
+# The views with their names, whether they are in the order of the prompt, the instruction.
+_Observation = tuple[list[tuple[str | None, _Frame]], bool, str | None]
 
 _Recorded = tuple[dict[Any, _Float32], dict[Any, _Float32]]  # attention and hidden rows, by place
 # rows by layer, and by observation and view the patches and the tokens
@@ -115,6 +117,7 @@ class ActionHead:
         attention: bool,
         hidden: bool,
     ) -> tuple[Context, _Recorded]: ...
+    def encode_features(self, features: list[BackboneFeatures]) -> Context: ...
     def sample(
         self,
         context: Context,
@@ -159,7 +162,12 @@ class ActionHead:
 class BackboneFeatures:
     @property
     def nbytes(self) -> int: ...
+    @property
+    def shape(self) -> tuple[int, int]: ...
+    @property
+    def num_views(self) -> int: ...
     def features(self) -> _Float32: ...
+    def masks(self) -> list[_Bool]: ...
     def views(self) -> list[list[_Int64]]: ...
 
 @final
@@ -228,9 +236,18 @@ class Processor:
     def texts(self, ids: list[int]) -> list[str]: ...
     def process(
         self,
-        observations: list[tuple[list[tuple[str | None, _Frame]], bool, str | None]],
+        observations: list[_Observation],
         plain_text: bool,
     ) -> tuple[list[_Float32], _Int64, _Bool, _Int64 | None, list[str] | None]: ...
+
+@final
+class Policy:
+    def __new__(cls, processor: Processor, backbone: Backbone, head: ActionHead) -> Policy: ...
+    def encode(
+        self,
+        observations: list[tuple[_Observation, bool]],  # and whether the instruction is plain text
+        previous: tuple[Context, list[BackboneFeatures]] | None,
+    ) -> tuple[Context, list[BackboneFeatures]]: ...
 
 @final
 class ProcessorSource:

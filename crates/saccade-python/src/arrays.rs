@@ -84,6 +84,14 @@ pub(crate) fn to_numpy<'py, T: Element>(
     data.into_pyarray(py).reshape(shape.to_vec())
 }
 
+pub(crate) fn owned_to_numpy<T: Element>(
+    py: Python<'_>,
+    array: OwnedArray<T>,
+) -> PyResult<Bound<'_, PyArrayDyn<T>>> {
+    let (data, shape) = array.into_parts();
+    to_numpy(py, data, &shape)
+}
+
 pub(crate) fn owned(array: &PyReadonlyArrayDyn<'_, f32>) -> PyResult<OwnedArray> {
     OwnedArray::new(copied("intervention", array.as_slice()?)?, array.shape()).map_err(raise)
 }

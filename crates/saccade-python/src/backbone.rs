@@ -8,7 +8,7 @@ use pyo3::prelude::*;
 use pyo3::types::{PyDict, PyTuple};
 use saccade_vla::{BackboneConfig, BackboneInputs, BackboneKeep, BackboneLoadOptions, OwnedArray};
 
-use crate::arrays::{Mask, held_tensors, optional_view, tensor_views, to_numpy, view};
+use crate::arrays::{Mask, held_tensors, optional_view, owned_to_numpy, tensor_views, to_numpy, view};
 use crate::detached::call;
 use crate::error::raise;
 
@@ -32,7 +32,7 @@ impl PyInputs<'_> {
 }
 
 #[pyclass(frozen, module = "saccade._saccade")]
-pub(crate) struct BackboneFeatures(Arc<saccade_vla::BackboneFeatures>);
+pub(crate) struct BackboneFeatures(pub(crate) Arc<saccade_vla::BackboneFeatures>);
 
 #[pymethods]
 impl BackboneFeatures {
@@ -41,10 +41,29 @@ impl BackboneFeatures {
         self.0.nbytes()
     }
 
+    /// `(batch, tokens)` of the features.
+    #[getter]
+    fn shape(&self) -> (usize, usize) {
+        (self.0.batch(), self.0.num_tokens())
+    }
+
+    /// The most views of a prompt.
+    #[getter]
+    fn num_views(&self) -> usize {
+        let views = (0..self.0.batch()).map(|prompt| self.0.views(prompt).count());
+        views.max().unwrap_or(0)
+    }
+
     /// `(batch, tokens, width)`.
     fn features<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArrayDyn<f32>>> {
         let shape = [self.0.batch(), self.0.num_tokens(), self.0.feature_dim()];
         to_numpy(py, call(py, || self.0.all_features())?, &shape)
+    }
+
+    /// `(batch, tokens)`: the attention mask as it was given, and which tokens are those of views.
+    fn masks<'py>(&self, py: Python<'py>) -> PyResult<[Bound<'py, PyArrayDyn<bool>>; 2]> {
+        let (attended, image) = call(py, || self.0.masks())?;
+        Ok([owned_to_numpy(py, attended)?, owned_to_numpy(py, image)?])
     }
 
     /// For each prompt the places of the image tokens of its views.
@@ -68,7 +87,7 @@ type PyBackboneRecord<'py> = (
 );
 
 #[pyclass(frozen, module = "saccade._saccade")]
-pub(crate) struct Backbone(saccade_vla::Backbone);
+pub(crate) struct Backbone(pub(crate) Arc<saccade_vla::Backbone>);
 
 #[pymethods]
 impl Backbone {
@@ -81,7 +100,7 @@ impl Backbone {
         num_threads: Option<usize>,
     ) -> PyResult<Self> {
         let options = options(config, precision, num_threads)?;
-        call(py, || saccade_vla::Backbone::load(&source, &options)).map(Self)
+        call(py, || saccade_vla::Backbone::load(&source, &options)).map(|made| Self(Arc::new(made)))
     }
 
     #[staticmethod]
@@ -95,7 +114,7 @@ impl Backbone {
         let options = options(config, precision, num_threads)?;
         let held = held_tensors(tensors)?;
         let views = tensor_views(&held)?;
-        call(py, || saccade_vla::Backbone::from_tensors(&views, &options)).map(Self)
+        call(py, || saccade_vla::Backbone::from_tensors(&views, &options)).map(|made| Self(Arc::new(made)))
     }
 
     fn config<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
@@ -143,10 +162,7 @@ impl Backbone {
         let encoded = call(py, || self.0.encode(&views, &previous, keep))?;
         let features = encoded.into_iter().map(|mut features| {
             let recorded = features.take_recorded();
-            let array = |array: OwnedArray| {
-                let (data, shape) = array.into_parts();
-                to_numpy(py, data, &shape)
-            };
+            let array = |array: OwnedArray| owned_to_numpy(py, array);
             let arrays = |given: Vec<OwnedArray>| given.into_iter().map(array).collect::<PyResult<Vec<_>>>();
             let nested =
                 |given: Vec<Vec<OwnedArray>>| given.into_iter().map(arrays).collect::<PyResult<Vec<_>>>();

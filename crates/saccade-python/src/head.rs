@@ -7,10 +7,12 @@ use numpy::{PyArrayDyn, PyReadonlyArrayDyn, PyReadwriteArrayDyn, PyUntypedArrayM
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 use saccade_vla::{
-    Chunking, Features, Group, Integrator, Keep, LoadOptions, NoisyActions, Sampling, TraceOptions,
+    Chunking, FeatureBatch, Features, Group, Integrator, Keep, LoadOptions, NoisyActions, Sampling,
+    TraceOptions,
 };
 
 use crate::arrays::{Mask, copied, held_tensors, optional_view, tensor_views, to_numpy, view, view_mut};
+use crate::backbone::BackboneFeatures;
 use crate::config::config_dict;
 use crate::context::Context;
 use crate::detached::call;
@@ -18,7 +20,7 @@ use crate::error::raise;
 use crate::intervention::{PyIntervention, PyRecorded, interventions, recorded};
 
 #[pyclass(frozen, module = "saccade._saccade")]
-pub(crate) struct ActionHead(saccade_vla::ActionHead);
+pub(crate) struct ActionHead(pub(crate) Arc<saccade_vla::ActionHead>);
 
 #[pymethods]
 impl ActionHead {
@@ -41,7 +43,7 @@ impl ActionHead {
             .with_num_states(num_states)
             .with_precision(precision.parse().map_err(raise)?)
             .with_num_threads(num_threads);
-        call(py, || saccade_vla::ActionHead::load(&source, &options)).map(Self)
+        call(py, || saccade_vla::ActionHead::load(&source, &options)).map(|made| Self(Arc::new(made)))
     }
 
     #[staticmethod]
@@ -62,7 +64,7 @@ impl ActionHead {
             .with_num_threads(num_threads);
         let held = held_tensors(tensors)?;
         let views = tensor_views(&held)?;
-        call(py, || saccade_vla::ActionHead::from_tensors(&views, &options)).map(Self)
+        call(py, || saccade_vla::ActionHead::from_tensors(&views, &options)).map(|made| Self(Arc::new(made)))
     }
 
     fn config<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
@@ -131,6 +133,21 @@ impl ActionHead {
         let mut context = call(py, || self.0.encode(&features))?;
         let kept = recorded(py, context.take_recorded())?;
         Ok((Context(Arc::new(context)), kept))
+    }
+
+    /// The context of features that a backbone of saccade's made.
+    fn encode_features(
+        &self,
+        py: Python<'_>,
+        features: Vec<PyRef<'_, BackboneFeatures>>,
+    ) -> PyResult<Context> {
+        let features: Vec<_> = features.iter().map(|features| Arc::clone(&features.0)).collect();
+        let context = call(py, || {
+            let features: Vec<&saccade_vla::BackboneFeatures> =
+                features.iter().map(|features| &**features).collect();
+            self.0.encode(&FeatureBatch::new(&features)?.as_features())
+        })?;
+        Ok(Context(Arc::new(context)))
     }
 
     #[allow(clippy::too_many_arguments)]

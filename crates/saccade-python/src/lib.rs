@@ -15,6 +15,7 @@ mod head;
 mod intervention;
 mod linalg;
 mod machine;
+mod policy;
 mod processor;
 mod rewrite;
 
@@ -43,6 +44,8 @@ mod _saccade {
         PyProfile, StayOnThisThread, available_isas, cpu_report, default_num_threads, dot_products,
         measure_peaks, selected_isa,
     };
+    #[pymodule_export]
+    use crate::policy::Policy;
     #[pymodule_export]
     use crate::processor::{Processor, ProcessorSource};
     #[pymodule_export]

@@ -1,20 +1,19 @@
 //! `saccade._saccade.Processor`: frames and words to the inputs of a backbone.
 
 use std::path::PathBuf;
+use std::sync::Arc;
 
 use numpy::{PyArrayDyn, PyReadonlyArrayDyn};
 use pyo3::prelude::*;
-use saccade_vla::{
-    Frame, Observation, OwnedArray, Preprocessing, ProcessorOptions, Tokenizer, TokenizerFiles,
-};
+use saccade_vla::{Frame, Observation, Preprocessing, ProcessorOptions, Tokenizer, TokenizerFiles};
 
-use crate::arrays::{to_numpy, view};
+use crate::arrays::{owned_to_numpy, to_numpy, view};
 use crate::detached::call;
 use crate::error::raise;
 
 /// A frame as the Python package gives it.
 #[derive(FromPyObject)]
-enum PyFrame<'py> {
+pub(crate) enum PyFrame<'py> {
     U8(PyReadonlyArrayDyn<'py, u8>),
     F32(PyReadonlyArrayDyn<'py, f32>),
     F64(PyReadonlyArrayDyn<'py, f64>),
@@ -30,8 +29,31 @@ impl PyFrame<'_> {
     }
 }
 
-/// The views of an observation, with their names where they have any; whether they are in the order of the prompt; and its instruction.
-type PyObservation<'py> = (Vec<(Option<String>, PyFrame<'py>)>, bool, Option<String>);
+/// An observation as the Python package gives it.
+#[derive(FromPyObject)]
+pub(crate) struct PyObservation<'py>(
+    /// The views, with their names if they have any.
+    Vec<(Option<String>, PyFrame<'py>)>,
+    /// Whether they are in the order of the prompt.
+    bool,
+    /// The instruction.
+    Option<String>,
+);
+
+impl PyObservation<'_> {
+    pub(crate) fn view(&self, plain_text: bool) -> PyResult<Observation<'_>> {
+        let Self(views, is_ordered, instruction) = self;
+        let views = views
+            .iter()
+            .map(|(name, frame)| Ok((name.as_deref(), frame.view()?)));
+        Ok(Observation {
+            views: views.collect::<PyResult<_>>()?,
+            is_ordered: *is_ordered,
+            instruction: instruction.as_deref(),
+            plain_text,
+        })
+    }
+}
 
 /// Arrays of pixels, ids `(batch, length)`, mask, grids `(views, 3)`, names of views.
 type PyPrepared<'py> = (
@@ -75,7 +97,7 @@ impl ProcessorSource {
 }
 
 #[pyclass(frozen, module = "saccade._saccade")]
-pub(crate) struct Processor(saccade_vla::Processor);
+pub(crate) struct Processor(pub(crate) Arc<saccade_vla::Processor>);
 
 #[pymethods]
 impl Processor {
@@ -106,7 +128,7 @@ impl Processor {
             let tokenizer = Tokenizer::read(&TokenizerFiles::at(&tokenizer)?)?;
             saccade_vla::Processor::new(version.parse()?, tokenizer, &options)
         })
-        .map(Self)
+        .map(|made| Self(Arc::new(made)))
     }
 
     /// That of a checkpoint, with these files and this path, or its own, and with these options in place of its own.
@@ -126,7 +148,7 @@ impl Processor {
             let files = tokenizer.as_deref().map(TokenizerFiles::at).transpose()?;
             source.0.processor(files.as_ref(), preprocessing, options)
         })
-        .map(Self)
+        .map(|made| Self(Arc::new(made)))
     }
 
     #[getter]
@@ -178,40 +200,20 @@ impl Processor {
     ) -> PyResult<PyPrepared<'py>> {
         let observations = observations
             .iter()
-            .map(|(views, is_ordered, instruction)| {
-                let views = views
-                    .iter()
-                    .map(|(name, frame)| Ok((name.as_deref(), frame.view()?)));
-                Ok(Observation {
-                    views: views.collect::<PyResult<_>>()?,
-                    is_ordered: *is_ordered,
-                    instruction: instruction.as_deref(),
-                    plain_text,
-                })
-            })
+            .map(|observation| observation.view(plain_text))
             .collect::<PyResult<Vec<_>>>()?;
         let prepared = call(py, || self.0.process(&observations))?;
-        let shape = [observations.len(), prepared.length];
         let pixels = prepared
             .pixel_values
             .into_iter()
             .map(|array| owned_to_numpy(py, array));
-        let grids = prepared.image_grid_thw;
-        let grid = match grids.is_empty() {
-            true => None,
-            false => Some(to_numpy(py, grids.concat(), &[grids.len(), 3])?),
-        };
+        let grid = prepared.image_grid_thw.map(|grid| owned_to_numpy(py, grid));
         Ok((
             pixels.collect::<PyResult<_>>()?,
-            to_numpy(py, prepared.input_ids, &shape)?,
-            to_numpy(py, prepared.attention_mask, &shape)?,
-            grid,
+            owned_to_numpy(py, prepared.input_ids)?,
+            owned_to_numpy(py, prepared.attention_mask)?,
+            grid.transpose()?,
             prepared.view_names,
         ))
     }
-}
-
-fn owned_to_numpy(py: Python<'_>, array: OwnedArray) -> PyResult<Bound<'_, PyArrayDyn<f32>>> {
-    let (data, shape) = array.into_parts();
-    to_numpy(py, data, &shape)
 }

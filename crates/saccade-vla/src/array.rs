@@ -30,6 +30,12 @@ impl<'a, T> Array<'a, T> {
         Ok(Self { data, shape })
     }
 
+    /// A view of `data` that was made with this `shape`.
+    pub(crate) fn made(data: &'a [T], shape: &'a [usize]) -> Self {
+        debug_assert_eq!(data.len(), shape.iter().product::<usize>());
+        Self { data, shape }
+    }
+
     /// The elements, last axis fastest.
     #[must_use]
     pub fn data(&self) -> &'a [T] {

@@ -2,11 +2,14 @@
 //!
 //! # Where things are
 //!
+//! - Policy (feature `processor`): a [`Policy`] is the three below in one: frames and words to a [`PolicyContext`], and actions from it.
 //! - Head: [`ActionHead::encode`] turns an observation's [`Features`] into a [`Context`], which holds the KV cache of every cross-attention
 //!   block. [`ActionHead::sample`] integrates the flow from noise to actions. [`Chunking`] joins a chunk to the one before (real-time
 //!   chunking), [`CrossAttention`] is one such layer alone.
 //! - Backbone: [`Backbone::encode`] turns pixels and token ids into features, and reuses what an earlier call computed of the same views.
-//! - Processor (feature `processor`): [`Processor::process`] turns frames and an instruction into those pixels and ids.
+//!   A [`FeatureBatch`] of them is what the head takes.
+//! - Processor (feature `processor`): [`Processor::process`] turns frames and an instruction into those pixels and ids
+//!   ([`Prepared::as_inputs`]).
 //! - Inspection: an [`Intervention`] cuts attention, adds biases to keys, or replaces rows; [`ActionHead::trace`] records what goes on
 //!   inside, [`linalg`] has ridge regression, principal components, CKA and principal angles for it.
 //! - Checkpoints: [`HeadCheckpoint`] and [`BackboneCheckpoint`] are open and not loaded; [`convert`], [`quantize`] and [`resize`] (feature
@@ -29,6 +32,8 @@ mod inspect;
 mod nn;
 mod ops;
 mod options;
+#[cfg(feature = "processor")]
+mod policy;
 mod precision;
 #[cfg(feature = "processor")]
 mod processor;
@@ -46,7 +51,7 @@ mod workspaces;
 pub use array::{Array, ArrayMut, OwnedArray};
 pub use backbone::{
     Backbone, BackboneCheckpoint, BackboneConfig, BackboneFeatures, BackboneInputs, BackboneKeep,
-    BackboneLoadOptions, BackboneRecord, LanguageConfig, VisionConfig,
+    BackboneLoadOptions, BackboneRecord, FeatureBatch, LanguageConfig, VisionConfig,
 };
 pub use config::HeadConfig;
 pub use engine::Engine;
@@ -64,6 +69,8 @@ pub use inspect::linalg;
 pub use inspect::trace::{Keep, Recorded, StepBlock, Trace, TraceOptions};
 pub use nn::source::memory::{ElementsRef, TensorView, TensorViews};
 pub use ops::interruptible;
+#[cfg(feature = "processor")]
+pub use policy::{Policy, PolicyContext, PolicyLoadOptions};
 pub use precision::Precision;
 #[cfg(feature = "processor")]
 pub use processor::{

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 #: As dtypes: a comparison with the type `np.float32` makes a dtype each time.
 FLOAT32 = np.dtype(np.float32)
 INT64 = np.dtype(np.int64)
+UINT8 = np.dtype(np.uint8)
 
 #: The precisions that weights are loaded in.
 PRECISIONS = ("float32", "bfloat16", "int8")
@@ -115,6 +116,8 @@ def inexact(integers: Any) -> int | None:
 
 def frame(name: str, value: ArrayLike) -> npt.NDArray[Any]:
     """A camera frame as a C-contiguous array of uint8, float32 or float64, copied only if it must be."""
+    if type(value) is np.ndarray and value.dtype == UINT8 and value.flags.c_contiguous:
+        return value  # the case of a control loop
     array = _asarray(name, value)
     if array.dtype not in (np.uint8, np.float32, np.float64):
         raise DtypeError(f"{name}: expected a frame of uint8, float32 or float64, got {array.dtype}")

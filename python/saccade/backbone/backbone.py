@@ -12,7 +12,7 @@ from saccade._internal.hub import locate
 from saccade._internal.hub_files import BACKBONE
 from saccade._internal.loaded import Loaded
 from saccade.backbone.config import BackboneConfig
-from saccade.backbone.features import RECORDS, BackboneFeatures, made
+from saccade.backbone.features import RECORDS, BackboneFeatures
 from saccade.backbone.inputs import BackboneInputs
 from saccade.errors import InputError
 from saccade.head.config import to_json
@@ -169,9 +169,8 @@ class Backbone(Loaded[_saccade.Backbone, BackboneConfig]):
         keep = check_record(record, RECORDS)
         held = [given._held for given in previous]
         encoded = self._engine.encode([_plain(given) for given in inputs], held, *keep)
-        token = self.config.image_token_id
         return [
-            made(found, recorded if any(keep) else None, given, token)
+            BackboneFeatures(found, given.view_names, given._is_torch, recorded if any(keep) else None)
             for (found, recorded), given in zip(encoded, inputs, strict=True)
         ]
 

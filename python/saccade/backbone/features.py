@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -64,29 +65,38 @@ class BackboneFeatures(Handle):
     def __init__(
         self,
         held: _saccade.BackboneFeatures,
-        arrays: tuple[Array, Array, Array],
-        views: dict[str, npt.NDArray[np.int64]],
-        record: BackboneRecord | None,
+        names: tuple[str, ...] | None,
+        use_torch: bool = False,
+        recorded: _saccade._BackboneRecorded | None = None,
     ) -> None:
         self._held = held
-        self._arrays = arrays
-        self._views = views
-        self._record = record
+        self._names = view_names(names, held.num_views)
+        self._torch = use_torch
+        self._record = None if recorded is None else self._made_record(*recorded)
 
     @property
     def backbone_features(self) -> Array:
         """The features, ``(batch, T, feature_dim)`` float32; a torch tensor if the inputs were torch."""
-        return self._arrays[0]
+        return self._features
+
+    @cached_property
+    def _features(self) -> Array:
+        return like_features(self._held.features(), self._torch)
 
     @property
     def attention_mask(self) -> Array:
         """Booleans ``(batch, T)``, True where a token is not padding, as it was given."""
-        return self._arrays[1]
+        return self._masks[0]
 
     @property
     def image_mask(self) -> Array:
         """Booleans ``(batch, T)``, True for tokens of views."""
-        return self._arrays[2]
+        return self._masks[1]
+
+    @cached_property
+    def _masks(self) -> tuple[Array, Array]:
+        attended, is_image = self._held.masks()
+        return like_features(attended, self._torch), like_features(is_image, self._torch)
 
     @property
     def views(self) -> dict[str, npt.NDArray[np.int64]]:
@@ -97,68 +107,60 @@ class BackboneFeatures(Handle):
         """
         return dict(self._views)
 
+    @cached_property
+    def _views(self) -> dict[str, npt.NDArray[np.int64]]:
+        views, places = {}, self._held.views()
+        for index, name in enumerate(self._names):
+            rows = [row[index] if index < len(row) else np.empty(0, np.int64) for row in places]
+            views[name] = np.full((len(rows), max(map(len, rows))), -1, np.int64)
+            for to, row in zip(views[name], rows, strict=True):
+                to[: len(row)] = row
+        return views
+
     @property
     def record(self) -> BackboneRecord | None:
         """The record, or None if nothing was to be recorded."""
         return self._record
 
+    def _made_record(
+        self, hidden: list[Any], vision: list[list[Any]], image_tokens: list[list[Any]]
+    ) -> BackboneRecord:
+        by_view = [
+            {
+                (row, self._names[index]): like_features(view, self._torch)
+                for row, found in enumerate(rows)
+                for index, view in enumerate(found)
+            }
+            for rows in (vision, image_tokens)
+        ]
+        by_layer = {layer: like_features(rows, self._torch) for layer, rows in enumerate(hidden)}
+        return BackboneRecord(by_layer, *by_view)
+
     @property
     def batch(self) -> int:
         """Number of observations."""
-        return int(self._arrays[0].shape[0])
+        return self._held.shape[0]
 
     @property
     def num_tokens(self) -> int:
         """Number of tokens of each observation (T)."""
-        return int(self._arrays[0].shape[1])
+        return self._held.shape[1]
 
     @property
     def nbytes(self) -> int:
-        """Size in memory, in bytes. Memory that several features share is counted in each of them."""
-        shown = sum(int(array.nbytes) for array in self._arrays)
+        """Size in memory, in bytes. Memory that several features share is counted in each of them.
+
+        The arrays of features and masks are made when they are first asked for, and counted from then on.
+        """
+        made = [vars(self)["_features"]] if "_features" in vars(self) else []
+        shown = sum(int(array.nbytes) for array in (*made, *vars(self).get("_masks", ())))
         return self._held.nbytes + shown + (0 if self._record is None else self._record.nbytes)
 
     def __repr__(self) -> str:
-        views = ", ".join(self._views)
         return (
-            f"<saccade.BackboneFeatures batch={self.batch} num_tokens={self.num_tokens} views=[{views}] "
-            f"nbytes={self.nbytes}>"
+            f"<saccade.BackboneFeatures batch={self.batch} num_tokens={self.num_tokens} "
+            f"views=[{', '.join(self._names)}] nbytes={self.nbytes}>"
         )
-
-
-def made(
-    held: _saccade.BackboneFeatures,
-    recorded: _saccade._BackboneRecorded | None,
-    inputs: Any,
-    image_token_id: int,
-) -> BackboneFeatures:
-    """The features of ``inputs`` from the result of the engine."""
-
-    def shown(array: npt.NDArray[Any]) -> Array:
-        return like_features(array, inputs._is_torch)
-
-    features, is_image = shown(held.features()), shown(inputs.input_ids == image_token_id)
-    places = held.views()
-    names = view_names(inputs.view_names, max(map(len, places), default=0))
-    views = {}
-    for index, name in enumerate(names):
-        rows = [row[index] if index < len(row) else np.empty(0, np.int64) for row in places]
-        views[name] = np.full((len(rows), max(map(len, rows))), -1, np.int64)
-        for to, row in zip(views[name], rows, strict=True):
-            to[: len(row)] = row
-    record = None
-    if recorded is not None:
-        hidden, *of_views = recorded
-        by_view = [
-            {
-                (row, names[index]): shown(view)
-                for row, found in enumerate(rows)
-                for index, view in enumerate(found)
-            }
-            for rows in of_views
-        ]
-        record = BackboneRecord({layer: shown(rows) for layer, rows in enumerate(hidden)}, *by_view)
-    return BackboneFeatures(held, (features, shown(inputs.attention_mask.copy()), is_image), views, record)
 
 
 def view_names(given: tuple[str, ...] | None, count: int) -> tuple[str, ...]:

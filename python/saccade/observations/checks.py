@@ -10,7 +10,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from saccade._internal.arrays import Float32Array, UInt8Array, exact_float32, inexact, is_torch
+from saccade._internal.arrays import UINT8, Float32Array, UInt8Array, exact_float32, inexact, is_torch
 from saccade._internal.warning import warn
 from saccade.errors import DtypeError, ShapeError
 from saccade.observations.requirements import Camera, Requirements
@@ -63,15 +63,15 @@ def check_frames(
     name: str, frames: Any, axes: tuple[int, ...], camera: Camera, needs: Requirements
 ) -> UInt8Array:
     """Frames of one camera, uint8 with colours last; ``axes`` are the numbers of axes that they may have."""
-    shape = f"uint8 of {' or '.join(map(str, axes))} axes that end in (height, width, 3)"
     frames = on_cpu(name, frames, needs)
     if is_torch(frames):
         frames = frames.numpy()
-    if not isinstance(frames, np.ndarray):
-        raise needs.dtype_error(name, f"an array, {shape}", type(frames).__name__)
-    if frames.dtype != np.uint8:
-        raise needs.dtype_error(name, shape, frames.dtype)
-    if frames.ndim not in axes or frames.shape[-1] != 3 or 0 in frames.shape:
+    if not isinstance(frames, np.ndarray) or frames.dtype != UINT8 or not _is_rgb(frames.shape, axes):
+        shape = f"uint8 of {' or '.join(map(str, axes))} axes that end in (height, width, 3)"
+        if not isinstance(frames, np.ndarray):
+            raise needs.dtype_error(name, f"an array, {shape}", type(frames).__name__)
+        if frames.dtype != UINT8:
+            raise needs.dtype_error(name, shape, frames.dtype)
         raise needs.shape_error(name, shape, f"shape {frames.shape}")
     height, width = frames.shape[-3:-1]
     if camera.height is not None and (height, width) != (camera.height, camera.width):
@@ -79,6 +79,10 @@ def check_frames(
             name, f"frames of {camera.height} x {camera.width} pixels", f"{height} x {width}"
         )
     return frames
+
+
+def _is_rgb(shape: tuple[int, ...], axes: tuple[int, ...]) -> bool:
+    return len(shape) in axes and shape[-1] == 3 and 0 not in shape
 
 
 def shape_of(name: str, value: Any, needs: Requirements) -> tuple[int, ...]:

@@ -8,6 +8,9 @@
 4. ``sampling``: sample normalised actions (:class:`saccade.ActionHead`).
 5. ``units``: convert them to the robot's units (:class:`saccade.Normalizer`) and the observation's format.
 
+If processor, backbone and head are saccade's own, steps 2 and 3 are one call of the engine, and pixels and
+features do not become arrays. Otherwise they are called one after the other.
+
 ``loading`` loads the parts from a checkpoint and checks that they fit each other, ``interfaces`` has what a
 policy requires of head and backbone, ``example`` makes an observation to try.
 """

@@ -1,18 +1,30 @@
-"""Step 3 of :meth:`saccade.Policy.act`: the backbone's features, and the context of the action head."""
+"""Step 3 of :meth:`saccade.Policy.act`: the backbone's features, and the context of the action head.
+
+If processor, backbone and head are saccade's own, steps 2 and 3 are one call of the engine.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeGuard, TypeVar
 
 import numpy as np
 
+import saccade._saccade as _saccade
+from saccade._internal.arrays import frame, text
+from saccade.backbone.backbone import Backbone
 from saccade.backbone.features import BackboneFeatures
 from saccade.backbone.inputs import BackboneInputs
 from saccade.errors import InputError
 from saccade.head.context import Context
+from saccade.head.head import ActionHead
+from saccade.observations import ParsedObservation
 from saccade.policy.interfaces import Head, VisionLanguageBackbone
+from saccade.policy.preparing import prepare_inputs
+from saccade.processor import Processor
+
+Part = TypeVar("Part")
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,6 +65,38 @@ class PolicyContext:
         return f"<saccade.PolicyContext batch={self.batch} num_vl_tokens={self.num_vl_tokens}>"
 
 
+def encode_observations(
+    parsed: Iterable[ParsedObservation],
+    processor: Processor,
+    backbone: VisionLanguageBackbone,
+    head: Head,
+    previous: PolicyContext | None = None,
+) -> PolicyContext:
+    """The context of each row of observations; ``previous`` as in :meth:`saccade.Policy.encode`."""
+    # Others may compute in their own way.
+    if not (
+        _is_own(processor, Processor)
+        and _is_own(backbone, Backbone)
+        and _is_own(head, ActionHead)
+        and (previous is None or _is_own_context(previous))
+    ):
+        return encode_features(compute_features(prepare_inputs(parsed, processor), backbone, previous), head)
+    observations: list[Any] = []
+    names: list[tuple[str, ...]] = []
+    for observation in parsed:
+        for frames, instruction in zip(observation.frames, observation.instructions, strict=True):
+            # Without their names, by which lerobot's processor would sort them: they are in order.
+            views = [(None, frame(f"frames[{index}]", one)) for index, one in enumerate(frames.values())]
+            told = None if instruction is None else text("instruction", instruction)
+            observations.append(((views, True, told), bool(observation.is_plain)))
+            names.append(tuple(frames))
+    engine = _saccade.Policy(processor._processor, backbone._engine, head._engine)
+    held = None if previous is None else (previous.context._held, [one._held for one in previous.features])
+    context, features = engine.encode(observations, held)
+    found = tuple(BackboneFeatures(one, named) for one, named in zip(features, names, strict=True))
+    return PolicyContext(Context(context, False, None), found)
+
+
 def compute_features(
     inputs: Sequence[BackboneInputs],
     backbone: VisionLanguageBackbone,
@@ -66,6 +110,10 @@ def compute_features(
 
 def encode_features(features: Sequence[BackboneFeatures], head: Head) -> PolicyContext:
     """The context of features, each a batch of one of any length."""
+    if _is_own(head, ActionHead) and all(type(one) is BackboneFeatures for one in features):
+        use_torch = len(features) == 1 and features[0]._torch
+        held = head._engine.encode_features([one._held for one in features])
+        return PolicyContext(Context(held, use_torch, None), tuple(features))
     # Shorter ones are padded, and their padding is dropped, which gives the bits without padding.
     lengths = [one.backbone_features.shape[1] for one in features]
     longest = max(lengths)
@@ -76,6 +124,16 @@ def encode_features(features: Sequence[BackboneFeatures], head: Head) -> PolicyC
         drop_vl=dropped if dropped.any() else None,
     )
     return PolicyContext(context, tuple(features))
+
+
+def _is_own(part: object, kind: type[Part]) -> TypeGuard[Part]:
+    """Whether a part is saccade's: not of a subclass, and with no method that was replaced."""
+    return type(part) is kind and not any(map(callable, vars(part).values()))
+
+
+def _is_own_context(previous: Any) -> bool:
+    parts = (previous.context, *previous.features) if isinstance(previous, PolicyContext) else (previous,)
+    return all(type(part) in (Context, BackboneFeatures) for part in parts)
 
 
 def pad_tokens(array: Any, length: int) -> Any:

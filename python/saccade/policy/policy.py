@@ -13,11 +13,10 @@ from saccade.head.chunking import Chunking
 from saccade.head.context import Context
 from saccade.head.intervention import Intervention
 from saccade.observations import Requirements
-from saccade.policy.encoding import PolicyContext, compute_features, encode_features
+from saccade.policy.encoding import PolicyContext, encode_observations
 from saccade.policy.example import example_observation
 from saccade.policy.interfaces import Head, VisionLanguageBackbone
 from saccade.policy.loading import check_fit, check_name, embodiment_of, load_parts, read_normalizer
-from saccade.policy.preparing import prepare_inputs
 from saccade.policy.reading import Observations, is_observation, read_observations, read_states
 from saccade.policy.sampling import Sampling, sample_actions, sample_state
 from saccade.policy.units import restore_units
@@ -220,8 +219,7 @@ class Policy:
             chunking=chunking,
         )
         batch = read_observations(observation, self.requirements)
-        inputs = prepare_inputs(batch, processor)
-        encoded = encode_features(compute_features(inputs, backbone, previous), self.head)
+        encoded = encode_observations(batch, processor, backbone, self.head, previous)
         actions = sample_actions(
             encoded.context, batch, options, self.head, self.normalizer, self.embodiment_id
         )
@@ -254,8 +252,7 @@ class Policy:
         """
         processor, backbone = self._require_backbone()
         batch = read_observations(observation, self.requirements)
-        inputs = prepare_inputs(batch, processor)
-        return encode_features(compute_features(inputs, backbone, previous), self.head)
+        return encode_observations(batch, processor, backbone, self.head, previous)
 
     def sample(
         self,

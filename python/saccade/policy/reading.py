@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Generic, TypeAlias, TypeVar
 
 import numpy as np
@@ -34,10 +35,11 @@ class Batch(Generic[Parsed]):
     def __len__(self) -> int:
         return len(self.parsed)
 
-    @property
+    @cached_property
     def state(self) -> Float32Array:
         """The states of all rows, ``(rows, state_history, state_width)`` in the robot's units."""
-        return np.concatenate([one.state for one in self.parsed])
+        states = [one.state for one in self.parsed]
+        return states[0] if len(states) == 1 else np.concatenate(states)
 
 
 def is_observation(value: Any) -> bool:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -104,12 +105,16 @@ class Normalizer(Robot):
     @property
     def state_slices(self) -> dict[str, slice]:
         """Slice of the robot's state by key."""
-        return _slices(self.state_groups)
+        return dict(self._slices[0])
 
     @property
     def action_slices(self) -> dict[str, slice]:
         """Slice of the robot's action by key."""
-        return _slices(self.action_groups)
+        return dict(self._slices[1])
+
+    @cached_property
+    def _slices(self) -> tuple[dict[str, slice], dict[str, slice]]:
+        return _slices(self.state_groups), _slices(self.action_groups)
 
     @property
     def state_width(self) -> int:

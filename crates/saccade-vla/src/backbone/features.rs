@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use saccade_vla_kernels::PackedKeyValues;
 
-use crate::alloc::{product, reserve};
+use crate::alloc::{filled, product, reserve};
 use crate::array::OwnedArray;
 use crate::error::Result;
 
@@ -107,6 +107,28 @@ impl BackboneFeatures {
     #[must_use]
     pub fn attention_mask(&self, prompt: usize) -> &[bool] {
         &self.prompts[prompt].attended
+    }
+
+    /// For each token of all prompts, `(batch, num_tokens)`, whether it may be attended to, and whether it is one of a view.
+    ///
+    /// # Errors
+    /// [`Error::Memory`](crate::Error::Memory).
+    pub fn masks(&self) -> Result<(OwnedArray<bool>, OwnedArray<bool>)> {
+        let shape = [self.batch(), self.num_tokens];
+        let len = product("masks", &shape)?;
+        let mut attended = Vec::new();
+        reserve("masks", &mut attended, len)?;
+        let mut image = filled("masks", len, false)?;
+        for (prompt, image) in self.prompts.iter().zip(image.chunks_exact_mut(self.num_tokens)) {
+            attended.extend_from_slice(&prompt.attended);
+            for &place in &prompt.image_tokens {
+                image[place] = true;
+            }
+        }
+        Ok((
+            OwnedArray::new(attended, &shape)?,
+            OwnedArray::new(image, &shape)?,
+        ))
     }
 
     /// The places of the image tokens of prompt number `prompt`, by view.

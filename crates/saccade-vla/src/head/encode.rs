@@ -30,6 +30,8 @@ pub struct Features<'a> {
     pub drop_vl: Option<Array<'a, bool>>,
     /// The parts of the VL self-attention to record.
     pub record: Keep,
+    /// Features that were found to be finite. They are not looked through again if they are the ones given.
+    finite: Option<&'a [f32]>,
 }
 
 impl<'a> Features<'a> {
@@ -42,6 +44,15 @@ impl<'a> Features<'a> {
             image_mask: None,
             drop_vl: None,
             record: Keep::default(),
+            finite: None,
+        }
+    }
+
+    /// Features that a backbone made, and found to be finite.
+    pub(crate) fn checked(backbone_features: Array<'a>) -> Self {
+        Self {
+            finite: Some(backbone_features.data()),
+            ..Self::new(backbone_features)
         }
     }
 
@@ -149,7 +160,12 @@ impl ActionHead {
                 got "{}", show_shape(array.shape())
             )));
         }
-        array.check_finite("backbone_features")?;
+        if !features
+            .finite
+            .is_some_and(|finite| std::ptr::eq(finite, array.data()))
+        {
+            array.check_finite("backbone_features")?;
+        }
         let masks = [
             ("attention_mask", features.attention_mask),
             ("image_mask", features.image_mask),

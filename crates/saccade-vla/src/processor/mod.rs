@@ -44,21 +44,40 @@ pub struct Observation<'a> {
     pub plain_text: bool,
 }
 
+impl<'a> Observation<'a> {
+    /// Frames with the names of their cameras, without an instruction.
+    #[must_use]
+    pub fn new(views: Vec<(Option<&'a str>, Frame<'a>)>) -> Self {
+        Self {
+            views,
+            ..Self::default()
+        }
+    }
+
+    /// With this instruction.
+    #[must_use]
+    pub fn with_instruction(self, instruction: impl Into<Option<&'a str>>) -> Self {
+        Self {
+            instruction: instruction.into(),
+            ..self
+        }
+    }
+}
+
 /// Inputs of a backbone, of a batch of observations.
 #[derive(Clone, Debug)]
+#[non_exhaustive]
 pub struct Prepared {
     /// N1.5: one array `(batch * views, 3, height, width)`. N1.6: an array `(1, 3, height, width)` for each
     /// view. N1.7: one array
     /// `(patches, 1536)`.
     pub pixel_values: Vec<OwnedArray>,
     /// The tokens `(batch, length)`, padded on the left.
-    pub input_ids: Vec<i64>,
+    pub input_ids: OwnedArray<i64>,
     /// `(batch, length)`: false where `input_ids` is padding.
-    pub attention_mask: Vec<bool>,
-    /// Tokens of the longest prompt.
-    pub length: usize,
-    /// N1.7: the grid of patches of every view.
-    pub image_grid_thw: Vec<[i64; 3]>,
+    pub attention_mask: OwnedArray<bool>,
+    /// N1.7: the grid of patches of every view, `(batch * views, 3)`: time, height, width.
+    pub image_grid_thw: Option<OwnedArray<i64>>,
     /// The names of the views in the order of the prompt, where they have names.
     pub view_names: Option<Vec<String>>,
 }
@@ -200,13 +219,17 @@ impl Processor {
             let tokens: Vec<usize> = views[first..].iter().map(|view: &View| view.tokens).collect();
             prompts.push(self.prompt_ids(observation, &tokens)?);
         }
-        let (input_ids, attention_mask, length) = self.padded(&prompts)?;
+        let (input_ids, attention_mask) = self.padded(&prompts)?;
+        let grids: Vec<[i64; 3]> = views.iter().filter_map(|view| view.grid).collect();
+        let image_grid_thw = match grids.is_empty() {
+            true => None,
+            false => Some(OwnedArray::new(grids.concat(), &[grids.len(), 3])?),
+        };
         Ok(Prepared {
-            image_grid_thw: views.iter().filter_map(|view| view.grid).collect(),
             pixel_values: self.joined(views)?,
             input_ids,
             attention_mask,
-            length,
+            image_grid_thw,
             view_names,
         })
     }
@@ -256,19 +279,34 @@ impl Processor {
             )));
         }
         check_length("instruction", observation.instruction.unwrap_or_default())?;
+        // A run of image tokens is tokenized as one of them, and then repeated.
+        let once = self.ids.image_stands_alone;
+        let written = |tokens: &usize| if once { 1.min(*tokens) } else { *tokens };
+        let written: Vec<usize> = views.iter().map(written).collect();
         let text = prompt(
             &self.settings,
             observation.instruction,
             observation.plain_text,
-            views,
+            &written,
         )?;
-        let ids = self.tokenizer.ids("instruction", &text)?;
+        let mut ids = self.tokenizer.ids("instruction", &text)?;
         let found = ids.iter().filter(|id| **id == self.ids.image).count();
-        if found != expected {
+        let written = written.iter().sum();
+        if found != written {
             return Err(Error::Input(problem!(
                 "instruction"; expected "no token that stands for an image";
-                got "{} of them", found.saturating_sub(expected)
+                got "{} of them", found.saturating_sub(written)
             )));
+        }
+        if once {
+            let mut runs = views.iter().filter(|tokens| **tokens > 0);
+            let mut repeated = Vec::new();
+            reserve("input_ids", &mut repeated, ids.len() - found + expected)?;
+            for id in ids {
+                let run = if id == self.ids.image { runs.next() } else { None };
+                repeated.extend(std::iter::repeat_n(id, run.copied().unwrap_or(1)));
+            }
+            ids = repeated;
         }
         if ids.len() > most {
             return Err(Error::Input(problem!(
@@ -280,7 +318,7 @@ impl Processor {
     }
 
     /// Ids and mask, filled up on the left to the longest prompt.
-    fn padded(&self, prompts: &[Vec<u32>]) -> Result<(Vec<i64>, Vec<bool>, usize)> {
+    fn padded(&self, prompts: &[Vec<u32>]) -> Result<(OwnedArray<i64>, OwnedArray<bool>)> {
         const WHAT: &str = "input_ids";
         let length = prompts.iter().map(Vec::len).max().unwrap_or(0);
         let len = product(WHAT, &[prompts.len(), length])?;
@@ -294,7 +332,8 @@ impl Processor {
             }
             mask[start..end].fill(true);
         }
-        Ok((ids, mask, length))
+        let shape = [prompts.len(), length];
+        Ok((OwnedArray::new(ids, &shape)?, OwnedArray::new(mask, &shape)?))
     }
 
     /// The views in the arrays that the backbone takes.
@@ -313,10 +352,11 @@ impl Processor {
             ),
         };
         shape[0] = rows;
-        let mut pixels = Vec::new();
+        let mut views = views.into_iter().map(|view| view.pixels);
+        let (mut pixels, _) = views.next().map(OwnedArray::into_parts).unwrap_or_default();
         reserve("pixel_values", &mut pixels, product("pixel_values", &shape)?)?;
-        for view in &views {
-            pixels.extend_from_slice(view.pixels.data());
+        for view in views {
+            pixels.extend_from_slice(view.data());
         }
         Ok(vec![OwnedArray::new(pixels, &shape)?])
     }

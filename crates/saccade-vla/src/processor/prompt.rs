@@ -19,6 +19,8 @@ static PLACEHOLDER: LazyLock<Regex> =
 pub(super) struct SpecialIds {
     /// Stands for a token of an image.
     pub image: u32,
+    /// Whether a run of its string is a run of this id in every text.
+    pub image_stands_alone: bool,
     /// Fills up a batch.
     pub padding: u32,
 }
@@ -44,7 +46,11 @@ impl SpecialIds {
             .filter(|token| tokenizer.id_of(token).is_none())
             .collect();
         match (tokenizer.id_of(view.image), tokenizer.id_of(PADDING)) {
-            (Some(image), Some(padding)) if missing.is_empty() => Ok(Self { image, padding }),
+            (Some(image), Some(padding)) if missing.is_empty() => Ok(Self {
+                image,
+                image_stands_alone: tokenizer.stands_alone(view.image),
+                padding,
+            }),
             _ => Err(Error::Checkpoint(problem!(
                 "tokenizer"; "the special tokens of {version} are missing: {}", missing.join(", ")
             ))),

@@ -165,6 +165,13 @@ impl Tokenizer {
         added.get_vocab().get(token).copied()
     }
 
+    /// Whether no other special token's string contains this one. Since they are found from left to right, the
+    /// longest first, a run of it is then always a run of its id.
+    pub(super) fn stands_alone(&self, token: &str) -> bool {
+        let added = self.inner.get_added_vocabulary().get_vocab();
+        added.keys().all(|other| other == token || !other.contains(token))
+    }
+
     /// Number of tokens, added ones included.
     #[must_use]
     pub fn len(&self) -> usize {

@@ -1,0 +1,182 @@
+//! A whole policy: camera frames and words in, a context out, and chunks of actions from it.
+
+mod load;
+
+use std::sync::Arc;
+
+use crate::array::{Array, ArrayMut};
+use crate::backbone::{Backbone, BackboneFeatures, BackboneInputs, BackboneKeep, FeatureBatch};
+use crate::error::{Error, Problem, Result};
+use crate::head::action_head::ActionHead;
+use crate::head::context::Context;
+use crate::head::sample::Sampling;
+use crate::processor::{Observation, Prepared, Processor};
+
+pub use load::PolicyLoadOptions;
+
+/// The three models of a policy: the processor of its frames and words, its backbone and its action head.
+///
+/// The state and the actions of [`sample`](Self::sample) are the head's: normalised, and padded with zeros to the
+/// widths of its config. Converting them from and to a robot's units takes the robot's statistics, which the Python
+/// package reads (`saccade.Normalizer`).
+///
+/// Immutable; serves any number of threads at once. A clone shares the models.
+///
+/// ```no_run
+/// use saccade_vla::{Array, Frame, Observation, Policy, PolicyLoadOptions};
+/// let policy = Policy::load("checkpoint".as_ref(), &PolicyLoadOptions::default())?;
+/// let pixels = vec![0; 480 * 640 * 3];
+/// let frame = Frame::U8(Array::new(&pixels, &[480, 640, 3])?);
+/// let seen = [Observation::new(vec![(Some("front"), frame)]).with_instruction("open the drawer")];
+/// let context = policy.encode(&seen, None)?;
+/// let next = policy.encode(&seen, Some(&context))?; // the same frame is not encoded again
+/// assert_eq!(next.batch(), 1);
+/// # Ok::<(), saccade_vla::Error>(())
+/// ```
+#[derive(Clone)]
+pub struct Policy {
+    processor: Arc<Processor>,
+    backbone: Arc<Backbone>,
+    head: Arc<ActionHead>,
+}
+
+/// Encoded observations of a policy. Immutable; serves any number of calls and threads.
+#[derive(Clone)]
+pub struct PolicyContext {
+    context: Arc<Context>,
+    features: Vec<Arc<BackboneFeatures>>,
+}
+
+impl PolicyContext {
+    /// The head's context of observations, and the features of each that it was made from.
+    #[must_use]
+    pub fn new(context: Arc<Context>, features: Vec<Arc<BackboneFeatures>>) -> Self {
+        Self { context, features }
+    }
+
+    /// The head's context: shorter observations padded, and the padding dropped.
+    #[must_use]
+    pub fn context(&self) -> &Arc<Context> {
+        &self.context
+    }
+
+    /// The backbone's features of each observation.
+    #[must_use]
+    pub fn features(&self) -> &[Arc<BackboneFeatures>] {
+        &self.features
+    }
+
+    /// Number of observations.
+    #[must_use]
+    pub fn batch(&self) -> usize {
+        self.features.len()
+    }
+
+    /// Number of vision-language tokens of the longest observation.
+    #[must_use]
+    pub fn num_vl_tokens(&self) -> usize {
+        self.context.num_vl_tokens()
+    }
+}
+
+impl Policy {
+    /// A policy of models that are loaded already.
+    #[must_use]
+    pub fn new(
+        processor: impl Into<Arc<Processor>>,
+        backbone: impl Into<Arc<Backbone>>,
+        head: impl Into<Arc<ActionHead>>,
+    ) -> Self {
+        Self {
+            processor: processor.into(),
+            backbone: backbone.into(),
+            head: head.into(),
+        }
+    }
+
+    /// The processor of frames and words.
+    #[must_use]
+    pub fn processor(&self) -> &Processor {
+        &self.processor
+    }
+
+    /// The vision-language backbone.
+    #[must_use]
+    pub fn backbone(&self) -> &Backbone {
+        &self.backbone
+    }
+
+    /// The action head.
+    #[must_use]
+    pub fn head(&self) -> &ActionHead {
+        &self.head
+    }
+
+    /// Encodes observations, which need not agree in their views or in the length of their prompts. Each has the
+    /// bits that it has alone.
+    ///
+    /// From `previous`, a context that this policy made, the tokens of views with the same frames and the unchanged
+    /// beginning of a prompt are taken. The bits are the same without it.
+    ///
+    /// # Errors
+    /// [`Error::Input`] for no observations, and those of [`Processor::process`], [`Backbone::encode`] and
+    /// [`ActionHead::encode`].
+    pub fn encode(
+        &self,
+        observations: &[Observation<'_>],
+        previous: Option<&PolicyContext>,
+    ) -> Result<PolicyContext> {
+        if observations.is_empty() {
+            return Err(Error::Input(Problem::expected(
+                "observations",
+                "at least one",
+                "none",
+            )));
+        }
+        let previous = previous.map_or(&[][..], PolicyContext::features);
+        let previous: Vec<&BackboneFeatures> = previous.iter().map(|features| &**features).collect();
+        let features = {
+            let prepared = observations
+                .iter()
+                .map(|observation| self.processor.process(std::slice::from_ref(observation)))
+                .collect::<Result<Vec<_>>>()?;
+            let inputs: Vec<_> = prepared.iter().map(Prepared::as_inputs).collect();
+            self.backbone
+                .encode(&inputs, &previous, BackboneKeep::default())?
+        };
+        let context = {
+            let features: Vec<&BackboneFeatures> = features.iter().collect();
+            self.head.encode(&FeatureBatch::new(&features)?.as_features())?
+        };
+        let features = features.into_iter().map(Arc::new).collect();
+        Ok(PolicyContext::new(Arc::new(context), features))
+    }
+
+    /// Samples chunks of normalised actions, as [`ActionHead::sample`] does.
+    ///
+    /// # Errors
+    /// As [`ActionHead::sample`].
+    pub fn sample(
+        &self,
+        context: &PolicyContext,
+        state: Array<'_>,
+        embodiment_id: Array<'_, i64>,
+        noise: Array<'_>,
+        sampling: &Sampling<'_>,
+        out: ArrayMut<'_>,
+    ) -> Result<()> {
+        self.head
+            .sample(&context.context, state, embodiment_id, noise, sampling, out)
+    }
+}
+
+impl Prepared {
+    /// The inputs of a backbone, without a copy.
+    #[must_use]
+    pub fn as_inputs(&self) -> BackboneInputs<'_> {
+        let pixel_values = self.pixel_values.iter().map(|pixels| pixels.view()).collect();
+        BackboneInputs::new(pixel_values, self.input_ids.view())
+            .with_attention_mask(self.attention_mask.view())
+            .with_image_grid_thw(self.image_grid_thw.as_ref().map(|grid| grid.view()))
+    }
+}
