@@ -8,7 +8,8 @@ use crate::error::Result;
 use crate::head::action_head::ActionHead;
 use crate::head::load::LoadOptions;
 use crate::options::setters;
-use crate::processor::{Preprocessing, ProcessorSource, TokenizerFiles};
+use crate::processor::{ProcessorSource, TokenizerFiles};
+use crate::release::Preprocessing;
 
 /// How a policy is loaded.
 ///

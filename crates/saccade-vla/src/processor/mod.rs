@@ -196,7 +196,7 @@ impl Processor {
     /// };
     /// let prepared = processor.process(&[observation])?;
     /// assert_eq!(prepared.pixel_values[0].shape(), [1, 3, 56, 56]);
-    /// assert_eq!(prepared.input_ids.len(), prepared.length);
+    /// assert_eq!(prepared.input_ids.shape()[0], 1);
     /// # Ok::<(), saccade_vla::Error>(())
     /// ```
     ///

@@ -7,7 +7,7 @@ use serde_json::json;
 
 use super::version::Version;
 use crate::array::{Array, ArrayMut};
-use crate::backbone::{Backbone, BackboneInputs, BackboneKeep, BackboneLoadOptions, published_specs};
+use crate::backbone::{Backbone, BackboneKeep, BackboneLoadOptions, published_specs};
 use crate::config::HeadConfig;
 use crate::head::action_head::ActionHead;
 use crate::head::encode::Features;
@@ -96,7 +96,7 @@ fn a_made_up_release_needs_its_row_only() {
     // 20 x 12 pixels have the greatest area; 16 x 8 are whole tokens.
     let pixels = &prepared.pixel_values[0];
     assert_eq!(pixels.shape(), [1, 3, 16, 8]);
-    let prompt = processor.texts(&prepared.input_ids).unwrap().concat();
+    let prompt = processor.texts(prepared.input_ids.data()).unwrap().concat();
     assert_eq!(
         prompt,
         "<|im_start|>do lift the cup with<image 1><|box_start|><|fim_pad|><|fim_pad|><|box_end|><|im_end|>"
@@ -104,20 +104,19 @@ fn a_made_up_release_needs_its_row_only() {
 
     let backbone = Backbone::load(path, &BackboneLoadOptions::default()).unwrap();
     assert_eq!(backbone.config().version, version);
-    let batch = [1, prepared.length];
-    let pixels = Array::new(pixels.data(), pixels.shape()).unwrap();
-    let ids = Array::new(&prepared.input_ids, &batch).unwrap();
-    let inputs = BackboneInputs::new(vec![pixels], ids);
-    let encoded = backbone.encode(&[inputs], &[], BackboneKeep::default()).unwrap();
+    let encoded = backbone
+        .encode(&[prepared.as_inputs()], &[], BackboneKeep::default())
+        .unwrap();
     let features = &encoded[0];
 
     let head = ActionHead::load(path, &LoadOptions::default()).unwrap();
     let rows = features.all_features().unwrap();
-    let shape = [1, prepared.length, features.feature_dim()];
+    let batch = prepared.input_ids.shape();
+    let shape = [1, batch[1], features.feature_dim()];
     let image = i64::from(processor.image_token_id());
-    let is_image: Vec<bool> = prepared.input_ids.iter().map(|id| *id == image).collect();
+    let is_image: Vec<bool> = prepared.input_ids.data().iter().map(|id| *id == image).collect();
     let features = Features::new(Array::new(&rows, &shape).unwrap())
-        .with_image_mask(Array::new(&is_image, &batch).unwrap());
+        .with_image_mask(Array::new(&is_image, batch).unwrap());
     let context = head.encode(&features).unwrap();
     let mut actions = [f32::NAN; 24];
     head.sample(
