@@ -340,6 +340,12 @@ def sanitize(session: nox.Session) -> None:
 
 
 @nox.session
+def portable(session: nox.Session) -> None:
+    """Run the kernel tests without intrinsics and system calls, as Miri does in a workflow."""
+    session.run(str(ROOT / ".ci/sanitize.sh"), "portable", external=True)
+
+
+@nox.session
 def loom(session: nox.Session) -> None:
     """Run the models of the thread pool in every order of threads, up to some preemptions."""
     cargo(session, "test", "--locked", "--quiet", "--manifest-path", "loom/Cargo.toml")

@@ -1,9 +1,11 @@
 #!/usr/bin/env bash
 # Tests of the kernels, the only crate with unsafe code, under tools that see what tests do not.
 #
-#   .ci/sanitize.sh            both of these
+#   .ci/sanitize.sh            address and valgrind
 #   .ci/sanitize.sh address    AddressSanitizer, on every instruction set of this CPU; needs a nightly Rust
 #   .ci/sanitize.sh valgrind   valgrind, which emulates a CPU without AVX-512: the portable and AVX2 paths, and tiles in software
+#   .ci/sanitize.sh portable   no tool: without intrinsics and system calls (--cfg saccade_portable), as Miri runs them
+#   .ci/sanitize.sh miri       the same tests of the library under Miri; needs a nightly Rust with Miri
 set -euo pipefail
 cd "$(dirname "$0")/.."
 
@@ -34,12 +36,25 @@ valgrind() (
         --test-threads 1 --skip float64
 )
 
+# In a target folder of its own, because the flag concerns every crate. The longest tests compute fewer cases.
+portable() (
+    export RUSTFLAGS="--cfg saccade_portable --deny warnings" SACCADE_TEST_EMULATED=1
+    cargo test --locked --quiet --package saccade-vla-kernels --lib --tests --target-dir target/portable
+)
+
+# Without isolation, because tests read environment variables and clocks.
+miri() (
+    cargo +nightly miri --version >/dev/null 2>&1 || fail "needs Miri: rustup toolchain install nightly --component miri"
+    export RUSTFLAGS="--cfg saccade_portable" MIRIFLAGS="-Zmiri-disable-isolation" SACCADE_TEST_EMULATED=1
+    cargo +nightly miri test --locked --package saccade-vla-kernels --lib --target-dir target/miri
+)
+
 case ${1:-} in
 '')
     address
     valgrind
     ;;
-address | valgrind) "$1" ;;
+address | valgrind | portable | miri) "$1" ;;
 *)
     sed -n '2,/^[^#]/s/^# \{0,1\}//p' "$0"
     exit 2

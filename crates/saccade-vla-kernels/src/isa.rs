@@ -6,7 +6,7 @@ use std::str::FromStr;
 use crate::cpu::tiles::{Refusal, permission};
 use crate::gemm::elements::{F32, Int8, RoundedBf16, WidenedBf16};
 use crate::gemm::in_vectors::InVectors;
-#[cfg(target_arch = "aarch64")]
+#[cfg(all(target_arch = "aarch64", not(saccade_portable)))]
 use crate::gemm::neon::{DotprodInt8, I8mmInt8, Lanes, MatrixBf16, WideningInt8};
 use crate::gemm::{Gemm, available};
 #[allow(
@@ -14,10 +14,10 @@ use crate::gemm::{Gemm, available};
     reason = "not every architecture and set of features has such products"
 )]
 use crate::gemm::{elements::Bf16, in_tiles::InTiles};
-#[cfg(target_arch = "aarch64")]
+#[cfg(all(target_arch = "aarch64", not(saccade_portable)))]
 use crate::simd::aarch64::neon::{Neon, NeonBf16, NeonDotprod, NeonI8mm};
 use crate::simd::portable::Portable;
-#[cfg(target_arch = "x86_64")]
+#[cfg(all(target_arch = "x86_64", not(saccade_portable)))]
 use crate::simd::x86_64::{
     avx2::{Avx2, Avx2EvexVnni, Avx2VexVnni},
     avx512::{Avx512, Avx512Amx, Avx512Bf16, Avx512Vnni},
@@ -29,7 +29,7 @@ use crate::tiles::TileKernel;
     reason = "not every architecture and set of features has tiles"
 )]
 use crate::tiles::TileUnit;
-#[cfg(target_arch = "x86_64")]
+#[cfg(all(target_arch = "x86_64", not(saccade_portable)))]
 use crate::tiles::amx::Amx;
 use crate::weights::{Arithmetic, Element};
 #[cfg(feature = "software-tiles")]
@@ -212,11 +212,11 @@ instruction_sets! {
         vectors: Portable, bf16: [], int8: [], gemm_bf16: [], gemm_int8: [], needs: [Portable],
     }
     /// AVX2 with FMA.
-    Avx2 = "avx2" if target_arch = "x86_64" {
+    Avx2 = "avx2" if all(target_arch = "x86_64", not(saccade_portable)) {
         vectors: Avx2, bf16: [], int8: [], gemm_bf16: [], gemm_int8: [], needs: [Avx2],
     }
     /// AVX2 with 256-bit int8 dot products: AVX-VNNI, or AVX512-VNNI with VL.
-    Avx2Vnni = "avx2vnni" if target_arch = "x86_64" {
+    Avx2Vnni = "avx2vnni" if all(target_arch = "x86_64", not(saccade_portable)) {
         vectors: Avx2,
         bf16: [],
         int8: [Avx2VexVnni, Avx2EvexVnni],
@@ -225,12 +225,12 @@ instruction_sets! {
         needs: [Avx2VexVnni, Avx2EvexVnni],
     }
     /// AVX-512 F, VL, BW and DQ, without dot products.
-    Avx512f = "avx512f" if target_arch = "x86_64" {
+    Avx512f = "avx512f" if all(target_arch = "x86_64", not(saccade_portable)) {
         vectors: Avx512, bf16: [], int8: [], gemm_bf16: [], gemm_int8: [], needs: [Avx512],
     }
     /// AVX-512 with whichever of the dot products AVX512-BF16 and AVX512-VNNI this CPU has; [`Isa::Avx512f`]
     /// where it has neither.
-    Avx512 = "avx512" if target_arch = "x86_64" {
+    Avx512 = "avx512" if all(target_arch = "x86_64", not(saccade_portable)) {
         vectors: Avx512,
         bf16: [Avx512Bf16],
         int8: [Avx512Vnni],
@@ -251,7 +251,7 @@ instruction_sets! {
         tiles: Software,
     }
     /// AVX-512, and products of bfloat16 and int8 in the tiles of AMX.
-    Amx = "amx" if target_arch = "x86_64" {
+    Amx = "amx" if all(target_arch = "x86_64", not(saccade_portable)) {
         vectors: Avx512,
         bf16: [Avx512Amx],
         int8: [Avx512Vnni],
@@ -261,7 +261,7 @@ instruction_sets! {
         tiles: Amx,
     }
     /// NEON, which every 64-bit ARM has.
-    Neon = "neon" if target_arch = "aarch64" {
+    Neon = "neon" if all(target_arch = "aarch64", not(saccade_portable)) {
         vectors: Neon,
         bf16: [],
         int8: [],
@@ -272,7 +272,7 @@ instruction_sets! {
         gemm_widened: InVectors<Neon, WidenedBf16, Lanes>,
     }
     /// NEON with dot products of int8.
-    Dotprod = "dotprod" if target_arch = "aarch64" {
+    Dotprod = "dotprod" if all(target_arch = "aarch64", not(saccade_portable)) {
         vectors: Neon,
         bf16: [],
         int8: [NeonDotprod],
@@ -283,7 +283,7 @@ instruction_sets! {
         gemm_widened: InVectors<Neon, WidenedBf16, Lanes>,
     }
     /// NEON with products of matrices of int8.
-    I8mm = "i8mm" if target_arch = "aarch64" {
+    I8mm = "i8mm" if all(target_arch = "aarch64", not(saccade_portable)) {
         vectors: Neon,
         bf16: [],
         int8: [NeonI8mm],
@@ -294,7 +294,7 @@ instruction_sets! {
         gemm_widened: InVectors<Neon, WidenedBf16, Lanes>,
     }
     /// NEON with products of bfloat16, and whichever of int8 this CPU has.
-    Bf16 = "bf16" if target_arch = "aarch64" {
+    Bf16 = "bf16" if all(target_arch = "aarch64", not(saccade_portable)) {
         vectors: Neon,
         bf16: [NeonBf16],
         int8: [NeonI8mm, NeonDotprod],
@@ -311,6 +311,7 @@ instruction_sets! {
 }
 
 /// What users call the instructions of `S`, where this CPU has them.
+#[allow(dead_code, reason = "not every architecture has such an instruction")]
 fn name_of<S: Simd>() -> Option<&'static str> {
     S::new().map(|_| S::DOT_NAME)
 }

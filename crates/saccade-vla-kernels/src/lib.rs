@@ -14,7 +14,7 @@ mod activation;
 mod aligned;
 mod attention;
 #[cfg_attr(
-    not(target_arch = "x86_64"),
+    not(all(target_arch = "x86_64", not(saccade_portable))),
     allow(
         dead_code,
         reason = "only x86-64 asks for all of it; its tests run everywhere"
@@ -36,7 +36,10 @@ mod rows;
 mod simd;
 mod threads;
 #[cfg_attr(
-    not(any(target_arch = "x86_64", feature = "software-tiles")),
+    not(any(
+        all(target_arch = "x86_64", not(saccade_portable)),
+        feature = "software-tiles"
+    )),
     allow(dead_code, reason = "no unit multiplies tiles there")
 )]
 mod tiles;

@@ -117,7 +117,7 @@ fn fastest(rate: impl Fn() -> Result<f64, PeakError>) -> Result<f64, PeakError> 
 /// not known how to measure it.
 #[must_use]
 pub fn clock_hz() -> Option<f64> {
-    #[cfg(any(target_arch = "x86_64", target_arch = "aarch64"))]
+    #[cfg(all(any(target_arch = "x86_64", target_arch = "aarch64"), not(saccade_portable)))]
     {
         const STEPS: u64 = 400_000;
         const CYCLES: f64 = if cfg!(target_arch = "x86_64") { 3.0 } else { 1.0 };
@@ -150,7 +150,7 @@ pub fn clock_hz() -> Option<f64> {
         }
         Some(CYCLES * STEPS as f64 / fastest)
     }
-    #[cfg(not(any(target_arch = "x86_64", target_arch = "aarch64")))]
+    #[cfg(any(saccade_portable, not(any(target_arch = "x86_64", target_arch = "aarch64"))))]
     None
 }
 

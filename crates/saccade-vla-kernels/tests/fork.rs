@@ -1,5 +1,5 @@
 //! The pool after `fork`: a child has the memory of its parent, but none of the threads.
-#![cfg(unix)]
+#![cfg(all(unix, not(saccade_portable)))]
 
 use std::collections::HashSet;
 use std::sync::Mutex;

@@ -1,5 +1,5 @@
 //! Memory and threads that the system refuses: errors, and fewer threads. In child processes, whose address space is limited.
-#![cfg(target_os = "linux")]
+#![cfg(all(target_os = "linux", not(saccade_portable)))]
 
 mod common;
 

@@ -1,6 +1,6 @@
 //! AMX in processes that may not use it, and in threads and children of those that may: the next best instruction set, and never an illegal
 //! instruction. Without AMX the same runs show that asking for it harms nothing.
-#![cfg(target_os = "linux")]
+#![cfg(all(target_os = "linux", not(saccade_portable)))]
 
 mod common;
 

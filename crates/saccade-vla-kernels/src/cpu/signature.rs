@@ -21,17 +21,17 @@ pub(crate) struct Signature {
 impl Signature {
     /// This CPU's; `None` where there is no CPUID.
     pub(super) fn current() -> Option<Self> {
-        #[cfg(target_arch = "x86_64")]
+        #[cfg(all(target_arch = "x86_64", not(saccade_portable)))]
         {
             let (vendor, version) = (std::arch::x86_64::__cpuid(0), std::arch::x86_64::__cpuid(1));
             Some(Self::decode([vendor.ebx, vendor.edx, vendor.ecx], version.eax))
         }
-        #[cfg(not(target_arch = "x86_64"))]
+        #[cfg(not(all(target_arch = "x86_64", not(saccade_portable))))]
         None
     }
 
     /// From the vendor's name in leaf 0 (`ebx`, `edx`, `ecx`) and `eax` of leaf 1.
-    #[cfg(any(target_arch = "x86_64", test))]
+    #[cfg(any(all(target_arch = "x86_64", not(saccade_portable)), test))]
     fn decode(vendor: [u32; 3], version: u32) -> Self {
         let mut name = [0; 12];
         for (to, word) in name.chunks_exact_mut(4).zip(vendor) {

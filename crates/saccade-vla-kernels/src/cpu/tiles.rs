@@ -103,19 +103,19 @@ const ENOSPC: i32 = 28;
 pub(crate) fn permission() -> Result<(), Refusal> {
     static ANSWER: OnceBox<Result<(), Refusal>> = OnceBox::new();
     *ANSWER.get_or_init(|| {
-        #[cfg(target_arch = "x86_64")]
+        #[cfg(all(target_arch = "x86_64", not(saccade_portable)))]
         let answer = ask(&ThisMachine);
-        #[cfg(not(target_arch = "x86_64"))]
+        #[cfg(not(all(target_arch = "x86_64", not(saccade_portable))))]
         let answer = Err(Refusal::NotThere);
         Box::new(answer)
     })
 }
 
 /// The CPU and the kernel below this process.
-#[cfg(target_arch = "x86_64")]
+#[cfg(all(target_arch = "x86_64", not(saccade_portable)))]
 struct ThisMachine;
 
-#[cfg(target_arch = "x86_64")]
+#[cfg(all(target_arch = "x86_64", not(saccade_portable)))]
 impl Machine for ThisMachine {
     fn cpuid(&self, leaf: u32, subleaf: u32) -> [u32; 4] {
         use std::arch::x86_64::{__cpuid, __cpuid_count};

@@ -28,7 +28,7 @@ pub(crate) trait Elements: Send + Sync + Sized + 'static {
     };
 
     /// Whether bfloat16 weights are widened to be multiplied in float32.
-    #[cfg(any(feature = "peak", target_arch = "aarch64"))]
+    #[cfg(any(feature = "peak", all(target_arch = "aarch64", not(saccade_portable))))]
     const IS_WIDENED: bool = matches!(
         (Self::WEIGHTS, Self::ROWS),
         (Element::Bf16, RowElements::F32 | RowElements::RoundedF32)
@@ -59,7 +59,7 @@ pub(crate) enum RowElements {
     /// Quantised to -128 ..= 127: bytes and zero points are 128 less than unsigned ones, and products are the
     /// same.
     #[cfg_attr(
-        not(target_arch = "aarch64"),
+        not(all(target_arch = "aarch64", not(saccade_portable))),
         allow(dead_code, reason = "for instructions of NEON")
     )]
     SignedBytes,
@@ -80,7 +80,7 @@ macro_rules! elements {
         }
     )+};
 }
-#[cfg(target_arch = "aarch64")]
+#[cfg(all(target_arch = "aarch64", not(saccade_portable)))]
 pub(super) use elements;
 
 elements! {

@@ -9,18 +9,24 @@ pub(crate) mod broadcast;
 mod convert;
 pub(crate) mod elements;
 #[cfg_attr(
-    not(any(target_arch = "x86_64", feature = "software-tiles")),
+    not(any(
+        all(target_arch = "x86_64", not(saccade_portable)),
+        feature = "software-tiles"
+    )),
     allow(dead_code, reason = "no unit multiplies tiles there")
 )]
 pub(crate) mod in_tiles;
 pub(crate) mod in_vectors;
 mod name;
-#[cfg(target_arch = "aarch64")]
+#[cfg(all(target_arch = "aarch64", not(saccade_portable)))]
 pub(crate) mod neon;
 pub(crate) mod outliers;
 mod pack;
 #[cfg_attr(
-    not(any(target_arch = "x86_64", feature = "software-tiles")),
+    not(any(
+        all(target_arch = "x86_64", not(saccade_portable)),
+        feature = "software-tiles"
+    )),
     allow(dead_code, reason = "no unit multiplies tiles there")
 )]
 mod prefetch;

@@ -4,12 +4,12 @@
 //! on its vectors are safe methods of the token. [`Simd::run`] is the only place that turns target features
 //! on; a [`Kernel`] is inlined into it whole, so that every operation becomes an instruction or a few.
 
-#[cfg(target_arch = "aarch64")]
+#[cfg(all(target_arch = "aarch64", not(saccade_portable)))]
 pub(crate) mod aarch64;
 pub(crate) mod bits;
 pub(crate) mod math;
 pub(crate) mod portable;
-#[cfg(target_arch = "x86_64")]
+#[cfg(all(target_arch = "x86_64", not(saccade_portable)))]
 pub(crate) mod x86_64;
 
 use bits::{Bits, cast, read, write};
@@ -258,10 +258,7 @@ pub(crate) trait Simd: Copy + Send + Sync + 'static {
 }
 
 /// Methods of a token that call functions with target features.
-#[cfg_attr(
-    not(any(target_arch = "x86_64", target_arch = "aarch64")),
-    allow(unused_macros, reason = "portable vectors need no features")
-)]
+#[cfg(all(any(target_arch = "x86_64", target_arch = "aarch64"), not(saccade_portable)))]
 macro_rules! forward {
     ($(fn $method:ident $(<const $n:ident: i32>)? ($($argument:ident: $type:ty),*) $(-> $result:ty)? = $function:ident;)*) => {$(
         #[inline(always)]
@@ -274,6 +271,7 @@ macro_rules! forward {
 }
 
 /// Functions with target features. Intrinsics are safe in them, unless they take pointers.
+#[cfg(all(any(target_arch = "x86_64", target_arch = "aarch64"), not(saccade_portable)))]
 macro_rules! functions {
     ($features:literal: $(
         $(#[$doc:meta])*
@@ -288,6 +286,7 @@ macro_rules! functions {
 
 /// A token: its features, found by `$detected`, a condition beside them, and constants, types and operations
 /// of its own. All other operations are functions of the module that uses this, by the names of the methods.
+#[cfg(all(any(target_arch = "x86_64", target_arch = "aarch64"), not(saccade_portable)))]
 macro_rules! token {
     (
         $(#[$doc:meta])*
@@ -352,7 +351,7 @@ macro_rules! token {
     };
 }
 
-#[cfg(any(target_arch = "x86_64", target_arch = "aarch64"))]
+#[cfg(all(any(target_arch = "x86_64", target_arch = "aarch64"), not(saccade_portable)))]
 use {forward, functions, token};
 
 /// Work that is written once for all instruction sets. `run` must be `#[inline(always)]`.
@@ -360,6 +359,7 @@ pub(crate) trait Kernel {
     type Output;
 
     /// Whether the kernel uses dot products of bfloat16, if there is an instruction for them.
+    #[allow(dead_code, reason = "not every architecture has such an instruction")]
     const USES_DOT_BF16: bool = false;
 
     fn run<S: Simd>(self, simd: S) -> Self::Output;

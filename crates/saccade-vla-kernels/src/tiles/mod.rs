@@ -4,7 +4,7 @@
 //! What drives a unit is written once for both, so that all of it but the instructions themselves runs on
 //! every machine.
 
-#[cfg(target_arch = "x86_64")]
+#[cfg(all(target_arch = "x86_64", not(saccade_portable)))]
 pub(crate) mod amx;
 #[cfg(feature = "software-tiles")]
 mod software;

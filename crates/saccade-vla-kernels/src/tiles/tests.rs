@@ -269,7 +269,7 @@ fn software_tiles_refuse_sizes_that_do_not_fit() {
 }
 
 /// Compares what both units make of a product with these operands.
-#[cfg(target_arch = "x86_64")]
+#[cfg(all(target_arch = "x86_64", not(saccade_portable)))]
 fn assert_equal(operation: Operation, rows: usize, steps: usize, x: &[u32], w: &[u32], before: &[u32]) {
     let amx = amx::Amx::new().expect("looked at before");
     let of = |columns: usize, apart: bool, add: bool| {
@@ -307,7 +307,7 @@ fn assert_equal(operation: Operation, rows: usize, steps: usize, x: &[u32], w: &
     }
 }
 
-#[cfg(target_arch = "x86_64")]
+#[cfg(all(target_arch = "x86_64", not(saccade_portable)))]
 #[test]
 fn hardware_and_software_tiles_agree_bit_for_bit() {
     use std::io::Write;
@@ -357,7 +357,7 @@ fn hardware_and_software_tiles_agree_bit_for_bit() {
     }
 }
 
-#[cfg(target_arch = "x86_64")]
+#[cfg(all(target_arch = "x86_64", not(saccade_portable)))]
 #[test]
 fn peaks_of_tiles_are_counted() {
     if let Some(amx) = amx::Amx::new() {
