@@ -313,7 +313,7 @@ def test_aarch64(session: nox.Session) -> None:
 
 @nox.session
 def fuzz(session: nox.Session) -> None:
-    """Fuzz headers, indexes, configs, resizing, tokenizers and processors, 1800 seconds each or those given.
+    """Fuzz parsers, processors, linear layers and attention, 1800 seconds each or those given.
 
     Needs a nightly Rust and cargo-fuzz. fuzz/README.md describes the targets.
     """
@@ -322,9 +322,12 @@ def fuzz(session: nox.Session) -> None:
         session.error("needs a nightly Rust (rustup toolchain install nightly) and cargo install cargo-fuzz")
     environment.run("fuzz/seeds.py")
     seconds = session.posargs[0] if session.posargs else "1800"
-    limits = ("-dict=fuzz/words.dict", f"-max_total_time={seconds}", "-timeout=10", "-rss_limit_mb=2048")
+    limits = (f"-max_total_time={seconds}", "-timeout=10", "-rss_limit_mb=2048")
     for target in ("header", "index", "config", "resize", "tokenizer", "processor"):
-        cargo(session, "+nightly", "fuzz", "run", "--sanitizer", "none", target, "--", *limits)
+        words = (target, "--", "-dict=fuzz/words.dict")
+        cargo(session, "+nightly", "fuzz", "run", "--sanitizer", "none", *words, *limits)
+    for target in ("linear", "attention"):
+        cargo(session, "+nightly", "fuzz", "run", target, "--", *limits)
 
 
 def succeeds(*command: str) -> bool:

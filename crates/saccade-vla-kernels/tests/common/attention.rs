@@ -10,7 +10,7 @@ use super::{ROUNDING, Strided, isas, numbers};
 pub const REMOVED: f32 = f32::NEG_INFINITY;
 
 /// Half a unit in the last place of 1 in bfloat16.
-const BF16_ROUNDING: f64 = 1.0 / 256.0;
+pub const BF16_ROUNDING: f64 = 1.0 / 256.0;
 
 /// A way to compute.
 #[derive(Clone, Copy)]

@@ -4,6 +4,7 @@
 
 pub mod attention;
 pub mod linear;
+pub mod random;
 
 use saccade_vla_kernels::{Isa, Rows, RowsMut};
 
