@@ -311,6 +311,12 @@ def test_aarch64(session: nox.Session) -> None:
     session.run(str(ROOT / ".ci/aarch64/run.sh"), "test", env={"CPUS": cpus}, external=True)
 
 
+@nox.session(name="test-i686")
+def test_i686(session: nox.Session) -> None:
+    """Check and run the kernel tests on 32-bit x86 (Debian)."""
+    session.run(str(ROOT / ".ci/i686/run.sh"), *(session.posargs or ["all"]), external=True)
+
+
 @nox.session
 def fuzz(session: nox.Session) -> None:
     """Fuzz parsers, processors, linear layers and attention, 1800 seconds each or those given.

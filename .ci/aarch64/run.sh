@@ -8,6 +8,7 @@
 #   .ci/aarch64/run.sh instructions   instructions a multiply-add of whole linear layers, counted by the emulator
 #   .ci/aarch64/run.sh lint       clippy of the Rust crates; a warning is an error
 #   .ci/aarch64/run.sh check      that three crates compile for macOS (ARM) and Windows (x86-64), with sources of the standard library
+#   .ci/aarch64/run.sh compiler   only the compiler, and sources of the standard library, for other targets
 #   .ci/aarch64/run.sh test       setup, rust and python
 #
 # CPUS are names of qemu, separated by spaces (default: max). Nothing that is installed is replaced: the compiler is
@@ -246,6 +247,7 @@ loops) loops ;;
 instructions) instructions ;;
 lint) lint ;;
 check) check ;;
+compiler) compiler && unpack rust-web-src lib/rustlib/src/rust/library ;;
 test) setup && rust && run_python ;;
 *)
     sed -n '2,/^[^#]/s/^# \{0,1\}//p' "$0"

@@ -114,7 +114,7 @@ mod tests {
             (5, 8),
             (0, 3),
             (LARGEST, 3),
-            (LARGEST, 1 << 40),
+            (LARGEST, 1 << (usize::BITS * 5 / 8)),
             (LARGEST, LARGEST),
         ] {
             assert_eq!(

@@ -20,13 +20,13 @@ fn repeated(count: usize) -> Rows<'static> {
 }
 
 /// Bytes of address space that this process uses.
-fn used() -> u64 {
+fn used() -> libc::rlim_t {
     let pages = std::fs::read_to_string("/proc/self/statm").unwrap();
-    pages.split(' ').next().unwrap().parse::<u64>().unwrap() * 4096
+    pages.split(' ').next().unwrap().parse::<libc::rlim_t>().unwrap() * 4096
 }
 
 /// Runs `work` in a child that may claim `more` bytes of address space; whether it returned true.
-fn limited(more: u64, work: impl FnOnce() -> bool) -> bool {
+fn limited(more: libc::rlim_t, work: impl FnOnce() -> bool) -> bool {
     // SAFETY: the child uses the allocator, which glibc keeps usable after fork, the pool, and `_exit`.
     let child = unsafe { libc::fork() };
     assert!(child >= 0, "fork failed");
@@ -48,7 +48,7 @@ fn limited(more: u64, work: impl FnOnce() -> bool) -> bool {
     waited == child && libc::WIFEXITED(status) && libc::WEXITSTATUS(status) == 0
 }
 
-const MORE: u64 = 16 << 20;
+const MORE: libc::rlim_t = 16 << 20;
 
 #[test]
 fn packing_weights_without_memory_is_an_error() {
@@ -92,7 +92,7 @@ fn keys_and_values_without_memory_are_an_error() {
             // What is held stays where more cannot be had, and is gone where it was to be replaced.
             held.append(1, many, many).is_err()
                 && held.len() == 4
-                && held.reserve(1 << 40).is_err()
+                && held.reserve(1 << (usize::BITS * 5 / 8)).is_err()
                 && held.len() == 4
                 && held.pack(1, many, many).is_err()
                 && held.is_empty()
