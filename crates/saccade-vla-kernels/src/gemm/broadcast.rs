@@ -12,9 +12,9 @@ use std::ops::Range;
 
 #[cfg(feature = "peak")]
 use super::elements::F32;
-use super::in_vectors::{MicroKernel, RunsOn};
+use super::elements::{SumVector, Sums};
 use super::prefetch::{Lines, Parts};
-use super::step::{Step, SumVector, Sums};
+use super::step::{MicroKernel, RunsOn, Step};
 use super::{Block, Shape};
 #[cfg(feature = "peak")]
 use crate::simd::MAX_LANES;

@@ -1,10 +1,8 @@
-//! What rows and weights are made of: how they are stored, and how the vectors of most instruction sets
-//! multiply them.
+//! What rows, weights and sums are made of, and how they are stored.
 
-use super::broadcast::Broadcast;
-use super::odd_lines;
-use super::step::{FloatSums, IntegerSums, Step, SumVector, Sums};
+use super::{SUM_PART, odd_lines};
 use crate::simd::Simd;
+use crate::simd::bits::{Bits, cast};
 use crate::weights::Element;
 
 /// Elements of rows and of packed weights that are multiplied with each other.
@@ -65,6 +63,50 @@ pub(crate) enum RowElements {
     SignedBytes,
 }
 
+/// Numbers that products are summed in.
+pub(crate) trait Sums: Send + Sync + 'static {
+    /// A vector of sums.
+    type Vector<S: Simd>: Bits;
+    /// Products that are summed from zero; the sums of such parts are added in order.
+    const PART: usize;
+
+    fn add<S: Simd>(simd: S, a: Self::Vector<S>, b: Self::Vector<S>) -> Self::Vector<S>;
+
+    #[inline(always)]
+    fn zero<S: Simd>(simd: S) -> Self::Vector<S> {
+        cast(simd.splat_i32(0))
+    }
+}
+
+/// float32.
+pub(crate) struct FloatSums;
+
+impl Sums for FloatSums {
+    type Vector<S: Simd> = S::F32;
+    const PART: usize = SUM_PART;
+
+    #[inline(always)]
+    fn add<S: Simd>(simd: S, a: S::F32, b: S::F32) -> S::F32 {
+        simd.add(a, b)
+    }
+}
+
+/// int32, which loses nothing and is not cut into parts.
+pub(crate) struct IntegerSums;
+
+impl Sums for IntegerSums {
+    type Vector<S: Simd> = S::I32;
+    const PART: usize = usize::MAX / 2;
+
+    #[inline(always)]
+    fn add<S: Simd>(simd: S, a: S::I32, b: S::I32) -> S::I32 {
+        simd.add_i32(a, b)
+    }
+}
+
+/// A vector of the sums of `E`.
+pub(crate) type SumVector<S, E> = <<E as Elements>::Sums as Sums>::Vector<S>;
+
 /// Defines elements: their part of a kernel's name, rows by weights, and sums.
 macro_rules! elements {
     ($($(#[$doc:meta])* $name:ident = $text:literal: $rows:ident by $weights:ident $(in groups of $group:literal)?, $sums:ident;)+) => {$(
@@ -96,112 +138,3 @@ elements! {
     /// Quads of bytes: rows of unsigned ones, weights of signed ones.
     Int8 = "int8": UnsignedBytes by Int8, IntegerSums;
 }
-
-impl Step<Broadcast> for F32 {
-    const DEPTH: usize = 1;
-
-    #[inline(always)]
-    unsafe fn multiply_add<S: Simd, const NV: usize, const MR: usize>(
-        simd: S,
-        sums: &mut [[S::F32; NV]; MR],
-        x: &[*const u32; MR],
-        step: usize,
-        weights: *const u32,
-        _: usize,
-    ) {
-        // SAFETY: the contract names a vector of weights for each of the sums, and a word of each row.
-        unsafe {
-            let mut w = [simd.splat(0.0); NV];
-            for (v, w) in w.iter_mut().enumerate() {
-                *w = simd.load_ptr(weights.add(v * S::LANES).cast());
-            }
-            for r in 0..MR {
-                let x = simd.splat(*x[r].add(step).cast());
-                for v in 0..NV {
-                    sums[r][v] = simd.fma(x, w[v], sums[r][v]);
-                }
-            }
-        }
-    }
-}
-
-/// Steps that widen weights.
-macro_rules! widening_steps {
-    ($($elements:ident),+) => {$(
-        impl Step<Broadcast> for $elements {
-            const DEPTH: usize = 2;
-            // Shares of the FMA peak at 296 x 2048 x 1536 on Zen 4: 8 and 7 rows of AVX-512 0.77 and 0.97, 6
-            // and 5 rows of AVX2 0.70 and 0.88.
-            const FEWER_GROUPS: usize = 1;
-
-            #[inline(always)]
-            unsafe fn multiply_add<S: Simd, const NV: usize, const MR: usize>(
-                simd: S,
-                sums: &mut [[S::F32; NV]; MR],
-                x: &[*const u32; MR],
-                step: usize,
-                weights: *const u32,
-                count: usize,
-            ) {
-                for part in 0..count {
-                    // SAFETY: the contract names a vector of weights for each of the sums, and `count` words
-                    // of each row.
-                    unsafe {
-                        let mut w = [simd.splat(0.0); NV];
-                        for (v, w) in w.iter_mut().enumerate() {
-                            let pairs = simd.load_words_ptr(weights.add(v * S::LANES));
-                            *w = if part == 0 {
-                                simd.low_halves(pairs)
-                            } else {
-                                simd.high_halves(pairs)
-                            };
-                        }
-                        for r in 0..MR {
-                            let x = simd.splat(*x[r].add(2 * step + part).cast());
-                            for v in 0..NV {
-                                sums[r][v] = simd.fma(x, w[v], sums[r][v]);
-                            }
-                        }
-                    }
-                }
-            }
-        }
-    )+};
-}
-widening_steps!(WidenedBf16, RoundedBf16);
-
-/// Steps whose operation sums all products of a word of the row and of a word of each column.
-macro_rules! step_of_dots {
-    ($elements:ident, $dot:ident) => {
-        impl Step<Broadcast> for $elements {
-            const DEPTH: usize = Self::PER_WORD;
-
-            #[inline(always)]
-            unsafe fn multiply_add<S: Simd, const NV: usize, const MR: usize>(
-                simd: S,
-                sums: &mut [[SumVector<S, Self>; NV]; MR],
-                x: &[*const u32; MR],
-                step: usize,
-                weights: *const u32,
-                _: usize,
-            ) {
-                // SAFETY: the contract names a vector of weights for each of the sums, and a word of each
-                // row.
-                unsafe {
-                    let mut w = [simd.splat_i32(0); NV];
-                    for (v, w) in w.iter_mut().enumerate() {
-                        *w = simd.load_words_ptr(weights.add(v * S::LANES));
-                    }
-                    for r in 0..MR {
-                        let x = simd.splat_i32(*x[r].add(step).cast());
-                        for v in 0..NV {
-                            sums[r][v] = simd.$dot(sums[r][v], x, w[v]);
-                        }
-                    }
-                }
-            }
-        }
-    };
-}
-step_of_dots!(Bf16, dot_bf16);
-step_of_dots!(Int8, dot_int8);

@@ -6,38 +6,10 @@ use std::mem::MaybeUninit;
 use super::convert::Convert;
 use super::name::{Joined, join};
 use super::outliers::MultiplyOutliers;
-use super::step::Step;
+use super::step::{MicroKernel, RunsOn, Step};
 use super::{Block, Conversion, Gemm, PanelMut, Shape, pack};
 use crate::simd::{Kernel, Simd};
 use crate::weights::{Element, WeightRef};
-
-/// A loop over the rows of a block and the steps of a panel that is written once for all [`Step`]s.
-///
-/// # Safety
-/// [`Self::multiply`] writes the sums that [`Gemm::multiply`] promises.
-pub(crate) unsafe trait MicroKernel: Sized + Send + Sync + 'static {
-    fn shape<S: Simd, E: Step<Self>>() -> Shape;
-
-    /// What [`Gemm::multiply`] does.
-    ///
-    /// # Safety
-    /// [`Block::check`] was called with the sizes of this micro-kernel and these elements; `S` has the
-    /// instructions that the elements need.
-    unsafe fn multiply<S: Simd, E: Step<Self>>(simd: S, block: &Block<'_>, sums: &mut [MaybeUninit<u32>]);
-
-    /// Steps of the largest tile for some milliseconds, as [`PeakLoop`](super::PeakLoop) has it.
-    ///
-    /// # Safety
-    /// `S` has the instructions that the elements need.
-    #[cfg(feature = "peak")]
-    unsafe fn multiply_for_peak<S: Simd, E: Step<Self>>(simd: S) -> usize;
-}
-
-/// Elements whose instructions the CPU of a token has.
-///
-/// # Safety
-/// That is so. It always is where the step uses operations of the token alone.
-pub(crate) unsafe trait RunsOn<S, L>: Step<L> {}
 
 /// Products of `E` in the vectors of `S` by the micro-kernel `L`.
 pub(crate) struct InVectors<S, E, L = super::broadcast::Broadcast> {

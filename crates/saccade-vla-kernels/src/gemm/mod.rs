@@ -6,6 +6,7 @@
 //! [`Step`](step::Step). A third is for tile units, [`in_tiles`].
 
 pub(crate) mod broadcast;
+mod broadcast_steps;
 mod convert;
 pub(crate) mod elements;
 #[cfg_attr(

@@ -1,53 +1,10 @@
-//! A step of a micro-kernel over the summed dimension, and its sums.
+//! Micro-kernels, and the steps over the summed dimension that they are made of.
 
-use super::SUM_PART;
-use super::elements::Elements;
+use std::mem::MaybeUninit;
+
+use super::elements::{Elements, SumVector};
+use super::{Block, Shape};
 use crate::simd::Simd;
-use crate::simd::bits::{Bits, cast};
-
-/// Numbers that products are summed in.
-pub(crate) trait Sums: Send + Sync + 'static {
-    /// A vector of sums.
-    type Vector<S: Simd>: Bits;
-    /// Products that are summed from zero; the sums of such parts are added in order.
-    const PART: usize;
-
-    fn add<S: Simd>(simd: S, a: Self::Vector<S>, b: Self::Vector<S>) -> Self::Vector<S>;
-
-    #[inline(always)]
-    fn zero<S: Simd>(simd: S) -> Self::Vector<S> {
-        cast(simd.splat_i32(0))
-    }
-}
-
-/// float32.
-pub(crate) struct FloatSums;
-
-impl Sums for FloatSums {
-    type Vector<S: Simd> = S::F32;
-    const PART: usize = SUM_PART;
-
-    #[inline(always)]
-    fn add<S: Simd>(simd: S, a: S::F32, b: S::F32) -> S::F32 {
-        simd.add(a, b)
-    }
-}
-
-/// int32, which loses nothing and is not cut into parts.
-pub(crate) struct IntegerSums;
-
-impl Sums for IntegerSums {
-    type Vector<S: Simd> = S::I32;
-    const PART: usize = usize::MAX / 2;
-
-    #[inline(always)]
-    fn add<S: Simd>(simd: S, a: S::I32, b: S::I32) -> S::I32 {
-        simd.add_i32(a, b)
-    }
-}
-
-/// A vector of the sums of `E`.
-pub(crate) type SumVector<S, E> = <<E as Elements>::Sums as Sums>::Vector<S>;
 
 /// One step of the micro-kernel `L` over `k`.
 pub(crate) trait Step<L>: Elements {
@@ -74,3 +31,31 @@ pub(crate) trait Step<L>: Elements {
         count: usize,
     );
 }
+
+/// A loop over the rows of a block and the steps of a panel that is written once for all [`Step`]s.
+///
+/// # Safety
+/// [`Self::multiply`] writes the sums that [`Gemm::multiply`] promises.
+pub(crate) unsafe trait MicroKernel: Sized + Send + Sync + 'static {
+    fn shape<S: Simd, E: Step<Self>>() -> Shape;
+
+    /// What [`Gemm::multiply`] does.
+    ///
+    /// # Safety
+    /// [`Block::check`] was called with the sizes of this micro-kernel and these elements; `S` has the
+    /// instructions that the elements need.
+    unsafe fn multiply<S: Simd, E: Step<Self>>(simd: S, block: &Block<'_>, sums: &mut [MaybeUninit<u32>]);
+
+    /// Steps of the largest tile for some milliseconds, as [`PeakLoop`](super::PeakLoop) has it.
+    ///
+    /// # Safety
+    /// `S` has the instructions that the elements need.
+    #[cfg(feature = "peak")]
+    unsafe fn multiply_for_peak<S: Simd, E: Step<Self>>(simd: S) -> usize;
+}
+
+/// Elements whose instructions the CPU of a token has.
+///
+/// # Safety
+/// That is so. It always is where the step uses operations of the token alone.
+pub(crate) unsafe trait RunsOn<S, L>: Step<L> {}

@@ -12,9 +12,8 @@ use std::ops::Range;
 
 #[cfg(feature = "peak")]
 use crate::gemm::elements::F32;
-use crate::gemm::elements::{Elements, RowElements};
-use crate::gemm::in_vectors::MicroKernel;
-use crate::gemm::step::{Step, SumVector, Sums};
+use crate::gemm::elements::{Elements, RowElements, SumVector, Sums};
+use crate::gemm::step::{MicroKernel, Step};
 use crate::gemm::{Block, SUM_PART, Shape};
 use crate::simd::bits::cast;
 use crate::simd::{LINE, Simd};

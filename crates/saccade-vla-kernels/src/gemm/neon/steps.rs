@@ -3,9 +3,10 @@
 use std::arch::aarch64::*;
 
 use super::micro_kernel::{Lanes, VECTOR};
-use crate::gemm::elements::{Elements, F32, RoundedBf16, RowElements, WidenedBf16, elements};
-use crate::gemm::in_vectors::RunsOn;
-use crate::gemm::step::{FloatSums, IntegerSums, Step, SumVector};
+use crate::gemm::elements::{
+    Elements, F32, FloatSums, IntegerSums, RoundedBf16, RowElements, SumVector, WidenedBf16, elements,
+};
+use crate::gemm::step::{RunsOn, Step};
 use crate::simd::Simd;
 use crate::simd::aarch64::instructions::{bfmmla, sdot_lane, usmmla};
 use crate::simd::aarch64::neon::{Neon, NeonBf16, NeonDotprod, NeonI8mm};
