@@ -76,7 +76,10 @@ class BackboneFeatures(Handle):
 
     @property
     def backbone_features(self) -> Array:
-        """The features, ``(batch, T, feature_dim)`` float32; a torch tensor if the inputs were torch."""
+        """The features, ``(batch, T, feature_dim)`` float32; a torch tensor if the inputs were torch.
+
+        A copy of what the engine holds: a policy does not see what is written to it.
+        """
         return self._features
 
     @cached_property

@@ -127,7 +127,7 @@ def encode_features(features: Sequence[BackboneFeatures], head: Head) -> PolicyC
 
 
 def _is_own(part: object, kind: type[Part]) -> TypeGuard[Part]:
-    """Whether a part is saccade's: not of a subclass, and with no method that was replaced."""
+    """Whether a part is saccade's: not of a subclass, and with no method replaced on the object."""
     return type(part) is kind and not any(map(callable, vars(part).values()))
 
 

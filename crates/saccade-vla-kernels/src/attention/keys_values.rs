@@ -266,7 +266,7 @@ impl PackedKeyValues {
             let steps = len.div_ceil(self.step()) * width;
             values_to[..steps].copy_from_slice(&values[..steps]);
             if !len.is_multiple_of(self.step()) {
-                // As above: a word holds two keys.
+                // A word holds two keys: of the last one, a half may stay zero.
                 values_to[steps - width..steps]
                     .iter_mut()
                     .for_each(|word| *word &= 0xffff);

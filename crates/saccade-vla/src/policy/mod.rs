@@ -69,7 +69,7 @@ impl PolicyContext {
     /// Number of observations.
     #[must_use]
     pub fn batch(&self) -> usize {
-        self.features.len()
+        self.context.batch()
     }
 
     /// Number of vision-language tokens of the longest observation.
@@ -115,8 +115,8 @@ impl Policy {
     /// Encodes observations, which need not agree in their views or in the length of their prompts. Each has the
     /// bits that it has alone.
     ///
-    /// From `previous`, a context that this policy made, the tokens of views with the same frames and the unchanged
-    /// beginning of a prompt are taken. The bits are the same without it.
+    /// From `previous`, a context whose features this backbone made, the tokens of views with the same frames and
+    /// the unchanged beginning of a prompt are taken. The bits are the same without it.
     ///
     /// # Errors
     /// [`Error::Input`] for no observations, and those of [`Processor::process`], [`Backbone::encode`] and
