@@ -3,8 +3,8 @@
     .ci/aarch64/run.sh loops
 
 Takes the assembly of saccade-vla-kernels. A loop is a block that ends in a jump to its own beginning; of
-those with the same instruction, the ones of the largest tile count. What a loop could do at most is what llvm-mca
-predicts for its multiply-adds alone, without loads and jumps.
+those with the same instruction, the ones of the largest tile count. What a loop could do at most is what
+llvm-mca predicts for its multiply-adds alone, without loads and jumps.
 """
 
 from __future__ import annotations
