@@ -177,7 +177,8 @@ def test_no_file_is_left_out() -> None:
         files = {path.relative_to(root).with_suffix("").parts for path in root.rglob("*.rs")}
         known = {path[:-1] if path[-1] in ("mod", "lib") else path for path in files}
         left = known - set(Crate(root).modules)
-        assert {path[-1] for path in left} <= {"tests", "test_support"}, root
+        # A release that tests add to the table, and the models of the pool that loom runs.
+        assert {path[-1] for path in left} <= {"tests", "test_support", "made_up", "models"}, root
 
 
 def planted(root: Path, low: str, high: str) -> list[list[str]]:
