@@ -58,7 +58,7 @@ impl Backbone {
     /// ```
     /// use saccade_vla::{Backbone, BackboneLoadOptions};
     /// let backbone = Backbone::load("examples/tiny".as_ref(), &BackboneLoadOptions::default())?;
-    /// assert_eq!(backbone.config().version, "n1.5");
+    /// assert_eq!(backbone.config().version, "n1.5".parse()?);
     /// # Ok::<(), saccade_vla::Error>(())
     /// ```
     ///

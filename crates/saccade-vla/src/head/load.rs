@@ -84,7 +84,7 @@ impl ActionHead {
     /// use saccade_vla::{ActionHead, LoadOptions, Precision};
     /// let options = LoadOptions::default().with_precision(Precision::Bfloat16).with_num_threads(1);
     /// let head = ActionHead::load("examples/tiny".as_ref(), &options)?;
-    /// assert_eq!((head.config().num_layers, head.num_threads()), (2, 1));
+    /// assert_eq!((head.config().num_layers, head.engine().threads), (2, 1));
     /// # Ok::<(), saccade_vla::Error>(())
     /// ```
     ///
