@@ -32,6 +32,7 @@ __all__ = [
     "CrossAttention",
     "HeadCheckpoint",
     "KeyValues",
+    "Policy",
     "Processor",
     "ProcessorSource",
     "Ridge",
