@@ -50,7 +50,7 @@ pub struct RowsMut<'a, T = f32> {
 
 // SAFETY: the view is a shared reference to its elements.
 unsafe impl<T: Sync> Send for Rows<'_, T> {}
-// SAFETY: as for Send.
+// SAFETY: a shared reference to the view only reads, as the view itself does.
 unsafe impl<T: Sync> Sync for Rows<'_, T> {}
 // SAFETY: the view is an exclusive reference to its elements.
 unsafe impl<T: Send> Send for RowsMut<'_, T> {}

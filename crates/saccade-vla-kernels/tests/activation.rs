@@ -1,5 +1,7 @@
 //! Activations and the exponential compared with float64, on every instruction set.
 
+mod common;
+
 use saccade_vla_kernels::{Isa, exp, gelu_erf, gelu_tanh, relu, silu};
 
 /// Values of the whole range: a coarse walk over the bits, a fine one over where it matters.
@@ -62,35 +64,6 @@ fn check(what: &str, f: fn(Isa, &mut [f32]), exact: fn(f64) -> f64, bounds: &Bou
     }
 }
 
-fn exact_gelu(x: f64) -> f64 {
-    let u = (2.0 / std::f64::consts::PI).sqrt() * (x + 0.044715 * x * x * x);
-    x / (1.0 + (-2.0 * u).exp())
-}
-
-/// By `erfc(z) = (2 / sqrt(pi)) exp(-z^2) (z + z^3 2/3 + ...)` from 1 for small `z`, and its continued
-/// fraction for large ones.
-fn exact_gelu_erf(x: f64) -> f64 {
-    let z = x.abs() / std::f64::consts::SQRT_2;
-    let erfc = if z < 2.0 {
-        let (mut term, mut sum) = (z, z);
-        let mut n = 1.0;
-        while term > 1e-17 * sum {
-            term *= 2.0 * z * z / (2.0 * n + 1.0);
-            sum += term;
-            n += 1.0;
-        }
-        1.0 - std::f64::consts::FRAC_2_SQRT_PI * (-z * z).exp() * sum
-    } else {
-        let fraction = (1..60).rev().fold(z, |rest, n| z + f64::from(n) / 2.0 / rest);
-        std::f64::consts::FRAC_2_SQRT_PI / 2.0 * (-z * z).exp() / fraction
-    };
-    x.max(0.0) - x.abs() * 0.5 * erfc
-}
-
-fn exact_silu(x: f64) -> f64 {
-    x / (1.0 + (-x).exp())
-}
-
 #[test]
 fn units_of_the_last_place() {
     for x in [1.0, 1.5, 3.0e38, -0.75, f32::MIN_POSITIVE] {
@@ -119,7 +92,7 @@ fn accuracy_of_gelu() {
         ulps: 4.0,
         absolute: 1e-7,
     };
-    check("GELU", gelu_tanh, exact_gelu, &bounds);
+    check("GELU", gelu_tanh, common::gelu_tanh, &bounds);
 }
 
 #[test]
@@ -131,7 +104,7 @@ fn accuracy_of_gelu_by_erf() {
         (0.5, 0.345_731_230_637_006_5),
         (3.0, 2.995_950_305_905_110_5),
     ] {
-        assert!((exact_gelu_erf(x) - exact).abs() < 1e-13, "{x}");
+        assert!((common::gelu_erf(x) - exact).abs() < 1e-13, "{x}");
     }
     let bounds = Bounds {
         from: -1.0,
@@ -139,7 +112,7 @@ fn accuracy_of_gelu_by_erf() {
         ulps: 8.0,
         absolute: 1e-7,
     };
-    check("GELU by erf", gelu_erf, exact_gelu_erf, &bounds);
+    check("GELU by erf", gelu_erf, common::gelu_erf, &bounds);
 }
 
 #[test]
@@ -176,7 +149,7 @@ fn accuracy_of_silu() {
         ulps: 4.0,
         absolute: 1e-35,
     };
-    check("SiLU", silu, exact_silu, &bounds);
+    check("SiLU", silu, common::silu, &bounds);
 }
 
 #[test]

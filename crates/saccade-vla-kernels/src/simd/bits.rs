@@ -8,18 +8,14 @@ use std::mem::MaybeUninit;
 /// Implement it for such types only.
 pub(crate) unsafe trait Bits: Copy {}
 
-// SAFETY: numbers have no padding, and every bit pattern is one.
-unsafe impl Bits for u8 {}
-// SAFETY: as of u8.
-unsafe impl Bits for u16 {}
-// SAFETY: as of u8.
-unsafe impl Bits for u32 {}
-// SAFETY: as of u8.
-unsafe impl Bits for i32 {}
-// SAFETY: as of u8.
-unsafe impl Bits for i64 {}
-// SAFETY: as of u8.
-unsafe impl Bits for f32 {}
+macro_rules! numbers {
+    ($($number:ty),+) => {$(
+        // SAFETY: numbers have no padding, and every bit pattern is one.
+        unsafe impl Bits for $number {}
+    )+};
+}
+numbers!(u8, u16, u32, i32, i64, f32);
+
 // SAFETY: arrays have no padding between their elements.
 unsafe impl<T: Bits, const N: usize> Bits for [T; N] {}
 

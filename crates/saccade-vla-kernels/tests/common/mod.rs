@@ -115,8 +115,10 @@ pub fn rows_mut(values: &mut [f32], columns: usize) -> RowsMut<'_> {
     RowsMut::new(values, columns)
 }
 
+/// `0.5 x (1 + tanh(u))`, without the difference of nearly equal numbers.
 pub fn gelu_tanh(x: f64) -> f64 {
-    0.5 * x * (1.0 + ((2.0 / std::f64::consts::PI).sqrt() * (x + 0.044715 * x * x * x)).tanh())
+    let u = (2.0 / std::f64::consts::PI).sqrt() * (x + 0.044715 * x * x * x);
+    x / (1.0 + (-2.0 * u).exp())
 }
 
 pub fn silu(x: f64) -> f64 {
