@@ -82,7 +82,10 @@ fn load() -> ActionHead {
     let path: PathBuf =
         std::env::temp_dir().join(format!("saccade-bench-{}.safetensors", std::process::id()));
     write_checkpoint(&path).expect("1.5 GB of room for temporary files");
-    let options = LoadOptions::default().with_config(config().to_string());
+    let options = LoadOptions {
+        config: Some(config().to_string()),
+        ..LoadOptions::default()
+    };
     let head = ActionHead::load(&path, &options);
     std::fs::remove_file(&path).expect("the file was just written");
     head.expect("the checkpoint that was just written")
@@ -110,7 +113,10 @@ fn main() {
                 Array::new(state, &[1, 64])?,
                 Array::new(&[0], &[])?,
                 Array::new(&noise[..samples * CHUNK], &[1, samples, 16, 32])?,
-                &Sampling::default().with_num_samples(samples),
+                &Sampling {
+                    num_samples: Some(samples),
+                    ..Sampling::default()
+                },
                 ArrayMut::new(&mut out, &[1, samples, 16, 32])?,
             )
         };

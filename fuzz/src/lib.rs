@@ -123,7 +123,7 @@ pub fn use_resize(folder: &Path, count: usize, config: &str, header: &[u8], byte
     let (source, out) = (folder.join("source"), folder.join("out"));
     let _ = fs::create_dir(&source);
     write_checkpoint(&source, config, header, bytes, 1 << 20);
-    let mut options = ResizeOptions::new(RewriteOptions::new(), count);
+    let mut options = ResizeOptions::new(RewriteOptions::default(), count);
     // Some inputs with what is added to copies, some without.
     options.perturbation = f64::from(u8::from(count % 2 == 1));
     match resize(&source, &out, &options, |_, _| true) {

@@ -92,9 +92,10 @@ impl CrossAttention {
         mut out: PyReadwriteArrayDyn<'_, f32>,
     ) -> PyResult<()> {
         let hidden_states = view(&hidden_states)?;
-        let keys = KeyOptions::default()
-            .with_key_mask(Mask::optional_view(&key_mask)?)
-            .with_key_bias(optional_view(&key_bias)?);
+        let keys = KeyOptions {
+            key_mask: Mask::optional_view(&key_mask)?,
+            key_bias: optional_view(&key_bias)?,
+        };
         let weights_shape = weights.as_ref().map(|weights| weights.shape().to_vec());
         let weights = match (&mut weights, &weights_shape) {
             (Some(weights), Some(shape)) => Some(view_mut(weights, shape)?),

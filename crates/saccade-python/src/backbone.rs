@@ -25,9 +25,12 @@ pub(crate) struct PyInputs<'py> {
 impl PyInputs<'_> {
     fn view(&self) -> PyResult<BackboneInputs<'_>> {
         let pixel_values = self.pixel_values.iter().map(view).collect::<PyResult<_>>()?;
-        Ok(BackboneInputs::new(pixel_values, view(&self.input_ids)?)
-            .with_attention_mask(self.attention_mask.view()?)
-            .with_image_grid_thw(optional_view(&self.image_grid_thw)?))
+        Ok(BackboneInputs {
+            pixel_values,
+            input_ids: view(&self.input_ids)?,
+            attention_mask: Some(self.attention_mask.view()?),
+            image_grid_thw: optional_view(&self.image_grid_thw)?,
+        })
     }
 }
 
@@ -155,10 +158,11 @@ impl Backbone {
         let previous: Vec<_> = previous.iter().map(|features| Arc::clone(&features.0)).collect();
         let previous: Vec<&saccade_vla::BackboneFeatures> =
             previous.iter().map(|features| &**features).collect();
-        let keep = BackboneKeep::default()
-            .with_hidden(hidden)
-            .with_vision(vision)
-            .with_image_tokens(image_tokens);
+        let keep = BackboneKeep {
+            hidden,
+            vision,
+            image_tokens,
+        };
         let encoded = call(py, || self.0.encode(&views, &previous, keep))?;
         let features = encoded.into_iter().map(|mut features| {
             let recorded = features.take_recorded();
@@ -210,10 +214,11 @@ fn options(
     precision: &str,
     num_threads: Option<usize>,
 ) -> PyResult<BackboneLoadOptions> {
-    Ok(BackboneLoadOptions::default()
-        .with_config(config)
-        .with_precision(precision.parse().map_err(raise)?)
-        .with_num_threads(num_threads))
+    Ok(BackboneLoadOptions {
+        config,
+        precision: precision.parse().map_err(raise)?,
+        num_threads,
+    })
 }
 
 fn backbone_config_dict<'py>(py: Python<'py>, config: &BackboneConfig) -> PyResult<Bound<'py, PyDict>> {

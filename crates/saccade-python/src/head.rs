@@ -36,13 +36,14 @@ impl ActionHead {
         precision: &str,
         num_threads: Option<usize>,
     ) -> PyResult<Self> {
-        let options = LoadOptions::default()
-            .with_config(config)
-            .with_embodiment_ids(embodiment_ids)
-            .with_action_horizon(action_horizon)
-            .with_num_states(num_states)
-            .with_precision(precision.parse().map_err(raise)?)
-            .with_num_threads(num_threads);
+        let options = LoadOptions {
+            config,
+            embodiment_ids,
+            action_horizon,
+            num_states,
+            precision: precision.parse().map_err(raise)?,
+            num_threads,
+        };
         call(py, || saccade_vla::ActionHead::load(&source, &options)).map(|made| Self(Arc::new(made)))
     }
 
@@ -56,12 +57,14 @@ impl ActionHead {
         precision: &str,
         num_threads: Option<usize>,
     ) -> PyResult<Self> {
-        let options = LoadOptions::default()
-            .with_config(config)
-            .with_embodiment_ids(embodiment_ids)
-            .with_num_states(num_states)
-            .with_precision(precision.parse().map_err(raise)?)
-            .with_num_threads(num_threads);
+        let options = LoadOptions {
+            config: Some(config),
+            embodiment_ids,
+            num_states,
+            precision: precision.parse().map_err(raise)?,
+            num_threads,
+            ..LoadOptions::default()
+        };
         let held = held_tensors(tensors)?;
         let views = tensor_views(&held)?;
         call(py, || saccade_vla::ActionHead::from_tensors(&views, &options)).map(|made| Self(Arc::new(made)))
@@ -125,11 +128,13 @@ impl ActionHead {
         attention: bool,
         hidden: bool,
     ) -> PyResult<(Context, PyRecorded<'py>)> {
-        let features = Features::new(view(&backbone_features)?)
-            .with_attention_mask(Mask::optional_view(&attention_mask)?)
-            .with_image_mask(Mask::optional_view(&image_mask)?)
-            .with_drop_vl(Mask::optional_view(&drop_vl)?)
-            .with_record(Keep::default().with_attention(attention).with_hidden(hidden));
+        let features = Features {
+            backbone_features: view(&backbone_features)?,
+            attention_mask: Mask::optional_view(&attention_mask)?,
+            image_mask: Mask::optional_view(&image_mask)?,
+            drop_vl: Mask::optional_view(&drop_vl)?,
+            record: Keep { attention, hidden },
+        };
         let mut context = call(py, || self.0.encode(&features))?;
         let kept = recorded(py, context.take_recorded())?;
         Ok((Context(Arc::new(context)), kept))
@@ -171,18 +176,23 @@ impl ActionHead {
         let shape = out.shape().to_vec();
         let (context, out) = (&context.0, view_mut(&mut out, &shape)?);
         let chunking = optional_view(&previous_chunk)?.zip(chunking).map(
-            |(previous_chunk, (overlap, frozen, ramp_rate, horizon))| {
-                Chunking::new(previous_chunk, overlap, frozen, ramp_rate).with_horizon(horizon)
+            |(previous_chunk, (overlap, frozen, ramp_rate, horizon))| Chunking {
+                previous_chunk,
+                overlap,
+                frozen,
+                ramp_rate,
+                horizon,
             },
         );
         let interventions = interventions(intervention)?;
-        let sampling = Sampling::default()
-            .with_num_steps(num_steps)
-            .with_integrator(Integrator::from_name(integrator).map_err(raise)?)
-            .with_num_samples(num_samples)
-            .with_future_refresh(future_refresh)
-            .with_chunking(chunking)
-            .with_interventions(&interventions);
+        let sampling = Sampling {
+            num_steps,
+            integrator: Integrator::from_name(integrator).map_err(raise)?,
+            num_samples,
+            future_refresh,
+            chunking,
+            interventions: &interventions,
+        };
         call(py, || {
             self.0
                 .sample(context, state, embodiment_id, noise, &sampling, out)
@@ -208,14 +218,18 @@ impl ActionHead {
         let (state, embodiment_id, noise) = (view(&state)?, view(&embodiment_id)?, view(&noise)?);
         let context = &context.0;
         let interventions = interventions(intervention)?;
-        let sampling = Sampling::default()
-            .with_num_steps(num_steps)
-            .with_interventions(&interventions);
-        let record = Keep::default().with_attention(attention).with_hidden(hidden);
-        let options = TraceOptions::new(record)
-            .with_blocks(blocks)
-            .with_steps(steps)
-            .with_max_bytes(max_bytes);
+        let sampling = Sampling {
+            num_steps,
+            interventions: &interventions,
+            ..Sampling::default()
+        };
+        let record = Keep { attention, hidden };
+        let options = TraceOptions {
+            record,
+            blocks,
+            steps,
+            max_bytes,
+        };
         let trace = call(py, || {
             self.0
                 .trace(context, state, embodiment_id, noise, &sampling, &options)

@@ -41,13 +41,14 @@ impl PyRewrite {
         ) -> saccade_vla::Result<R>
         + Send,
     ) -> PyResult<R> {
-        let mut options = RewriteOptions::new();
-        options.config = self.config;
-        options.head_only = self.head_only;
-        options.keep_backbone = self.keep_backbone;
-        options.force = self.force;
-        options.metadata = self.metadata;
-        options.max_shard_bytes = self.max_shard_bytes;
+        let options = RewriteOptions {
+            config: self.config,
+            head_only: self.head_only,
+            keep_backbone: self.keep_backbone,
+            force: self.force,
+            metadata: self.metadata,
+            max_shard_bytes: self.max_shard_bytes,
+        };
         let mut raised = None;
         let result = call(py, || {
             work(&self.source, &self.out, options, &mut |done, total| {
@@ -100,8 +101,12 @@ pub(crate) fn convert<'py>(
 ) -> PyResult<Bound<'py, PyDict>> {
     let dtype = dtype.map(|name| name.parse()).transpose().map_err(raise)?;
     let report = rewrite.run(py, |source, out, rewrite, progress| {
-        let mut options = ConvertOptions::new(rewrite);
-        (options.embodiment_ids, options.dtype, options.adapter) = (embodiment_ids, dtype, adapter);
+        let options = ConvertOptions {
+            rewrite,
+            embodiment_ids,
+            dtype,
+            adapter,
+        };
         saccade_vla::convert(source, out, &options, progress)
     })?;
     let dict = written_dict(py, report.written)?;
@@ -128,8 +133,12 @@ pub(crate) fn resize<'py>(
     seed: u64,
 ) -> PyResult<Bound<'py, PyDict>> {
     let report = rewrite.run(py, |source, out, rewrite, progress| {
-        let mut options = ResizeOptions::new(rewrite, num_future_tokens);
-        (options.perturbation, options.seed) = (perturbation, seed);
+        let options = ResizeOptions {
+            rewrite,
+            num_future_tokens,
+            perturbation,
+            seed,
+        };
         saccade_vla::resize(source, out, &options, progress)
     })?;
     let dict = written_dict(py, report.written)?;

@@ -41,7 +41,10 @@ fn act(policy: &Policy, context: &PolicyContext) -> Result<Vec<f32>> {
         Array::new(&state, &state_shape)?,
         Array::new(&[policy.head().embodiment_ids()[0] as i64], &[1])?,
         Array::new(&noise, &noise_shape)?,
-        &Sampling::default().with_num_steps(4),
+        &Sampling {
+            num_steps: Some(4),
+            ..Sampling::default()
+        },
         ArrayMut::new(&mut actions, &shape)?,
     )?;
     Ok(actions)
@@ -55,7 +58,14 @@ fn main() -> Result<()> {
     let checkpoint = std::env::args_os()
         .nth(1)
         .map_or_else(|| demo.into(), PathBuf::from);
-    let options = PolicyLoadOptions::default().with_head(LoadOptions::default().with_embodiment_ids(vec![0]));
+    let head = LoadOptions {
+        embodiment_ids: Some(vec![0]),
+        ..LoadOptions::default()
+    };
+    let options = PolicyLoadOptions {
+        head,
+        ..PolicyLoadOptions::default()
+    };
     let policy = Policy::load(&checkpoint, &options)?;
 
     let pictures = [10, 30, 50].map(picture);
@@ -63,7 +73,13 @@ fn main() -> Result<()> {
     let views = ["left", "right", "top"].into_iter().zip(&pictures);
     let views = views.map(|(camera, pixels)| Ok((Some(camera), Frame::U8(Array::new(pixels, &shape)?))));
     let views = views.collect::<Result<Vec<_>>>()?;
-    let told = |words| [Observation::new(views.clone()).with_instruction(words)];
+    let told = |words| {
+        [Observation {
+            views: views.clone(),
+            instruction: Some(words),
+            ..Observation::default()
+        }]
+    };
     let context = policy.encode(&told("pick up the red block"), None)?;
     println!("{} tokens", context.num_vl_tokens());
     let actions = act(&policy, &context)?;

@@ -57,8 +57,10 @@ fn main() -> Result<()> {
     let shape = [1, NUM_VL_TOKENS, config.context_dim];
     let features = numbers(shape.iter().product(), 1);
     let image_mask: Vec<bool> = (0..NUM_VL_TOKENS).map(|token| token % 3 == 0).collect();
-    let features = Features::new(Array::new(&features, &shape)?)
-        .with_image_mask(Array::new(&image_mask, &[1, NUM_VL_TOKENS])?);
+    let features = Features {
+        image_mask: Some(Array::new(&image_mask, &[1, NUM_VL_TOKENS])?),
+        ..Features::new(Array::new(&features, &shape)?)
+    };
     let context = head.encode(&features)?;
 
     let state_shape = [1, config.num_states, config.state_dim];
@@ -72,8 +74,17 @@ fn main() -> Result<()> {
             Array::new(&state, &state_shape)?,
             Array::new(&embodiment, &[1])?,
             Array::new(&noise, &noise_shape)?,
-            &Sampling::default().with_interventions(interventions),
-            &TraceOptions::new(Keep::default().with_attention(true)),
+            &Sampling {
+                interventions,
+                ..Sampling::default()
+            },
+            &TraceOptions {
+                record: Keep {
+                    attention: true,
+                    ..Keep::default()
+                },
+                ..TraceOptions::default()
+            },
         )
     };
 

@@ -40,8 +40,10 @@ fn main() -> Result<()> {
     let features = numbers(shape.iter().product(), 1);
     // Every third token is an image's: heads whose blocks alternate between text and images need to know.
     let image_mask: Vec<bool> = (0..NUM_VL_TOKENS).map(|token| token % 3 == 0).collect();
-    let features = Features::new(Array::new(&features, &shape)?)
-        .with_image_mask(Array::new(&image_mask, &[1, NUM_VL_TOKENS])?);
+    let features = Features {
+        image_mask: Some(Array::new(&image_mask, &[1, NUM_VL_TOKENS])?),
+        ..Features::new(Array::new(&features, &shape)?)
+    };
     let context = head.encode(&features)?;
 
     // Chunks are sampled from it as often as wanted.
@@ -56,7 +58,10 @@ fn main() -> Result<()> {
         Array::new(&state, &state_shape)?,
         Array::new(&[head.embodiment_ids()[0] as i64], &[1])?,
         Array::new(&noise, &noise_shape)?,
-        &Sampling::default().with_num_steps(4),
+        &Sampling {
+            num_steps: Some(4),
+            ..Sampling::default()
+        },
         ArrayMut::new(&mut actions, &shape)?,
     )?;
     for (step, action) in actions.chunks(config.action_dim).enumerate() {

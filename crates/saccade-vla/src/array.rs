@@ -18,6 +18,8 @@ use crate::error::{Error, Result, problem, show_shape};
 pub struct Array<'a, T = f32> {
     data: &'a [T],
     shape: &'a [usize],
+    /// Whether the elements were found to be finite, and need not be looked at again.
+    is_finite: bool,
 }
 
 impl<'a, T> Array<'a, T> {
@@ -27,13 +29,11 @@ impl<'a, T> Array<'a, T> {
     /// [`Error::Shape`] if the sizes in `shape` do not multiply to the length of `data`.
     pub fn new(data: &'a [T], shape: &'a [usize]) -> Result<Self> {
         check_length(data.len(), shape)?;
-        Ok(Self { data, shape })
-    }
-
-    /// A view of `data` that was made with this `shape`.
-    pub(crate) fn made(data: &'a [T], shape: &'a [usize]) -> Self {
-        debug_assert_eq!(data.len(), shape.iter().product::<usize>());
-        Self { data, shape }
+        Ok(Self {
+            data,
+            shape,
+            is_finite: false,
+        })
     }
 
     /// The elements, last axis fastest.
@@ -54,9 +54,22 @@ impl<'a, T> Array<'a, T> {
     }
 }
 
-impl Array<'_, f32> {
+impl<'a> Array<'a> {
+    /// A view of `data`, made with this `shape`, that was found to be finite.
+    pub(crate) fn finite(data: &'a [f32], shape: &'a [usize]) -> Self {
+        debug_assert_eq!(data.len(), shape.iter().product::<usize>());
+        Self {
+            data,
+            shape,
+            is_finite: true,
+        }
+    }
+
     /// Checks that no element is NaN or infinite.
     pub(crate) fn check_finite(self, name: &str) -> Result<Self> {
+        if self.is_finite {
+            return Ok(self);
+        }
         match first_not_finite(self.data) {
             None => Ok(self),
             Some(position) => Err(Error::Input(problem!(
@@ -171,6 +184,7 @@ impl<T> OwnedArray<T> {
         Array {
             data: &self.data,
             shape: &self.shape,
+            is_finite: false,
         }
     }
 

@@ -31,7 +31,6 @@ mod head;
 mod inspect;
 mod nn;
 mod ops;
-mod options;
 #[cfg(feature = "processor")]
 mod policy;
 mod precision;

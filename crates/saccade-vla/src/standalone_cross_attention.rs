@@ -12,7 +12,6 @@ use crate::nn::sequences::Sequences;
 use crate::nn::source::memory::{self, MemorySource, TensorViews};
 use crate::nn::source::planner::plan;
 use crate::nn::weights::{Builder, Weights};
-use crate::options::setters;
 use crate::precision::Precision;
 use crate::profile::Part;
 use crate::workspaces::Workspaces;
@@ -59,21 +58,11 @@ pub struct CrossAttention {
 
 /// Which keys count, and how much.
 #[derive(Clone, Copy, Debug, Default)]
-#[non_exhaustive]
 pub struct KeyOptions<'a> {
     /// `(batch, num_vl_tokens)`, true = attended.
     pub key_mask: Option<Array<'a, bool>>,
     /// `(batch, num_vl_tokens)`, added to the logits.
     pub key_bias: Option<Array<'a>>,
-}
-
-impl<'a> KeyOptions<'a> {
-    setters! {
-        /// With this mask.
-        with_key_mask(key_mask: impl Into<Option<Array<'a, bool>>>);
-        /// With this bias.
-        with_key_bias(key_bias: impl Into<Option<Array<'a>>>);
-    }
 }
 
 impl CrossAttention {

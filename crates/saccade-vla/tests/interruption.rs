@@ -31,10 +31,11 @@ fn planning_stops_without_a_panic() {
     let config = HeadConfig::from_json(&text).unwrap();
     assert!(!tensor_shapes(&config).unwrap().is_empty());
     assert!(stops(|| tensor_shapes(&config)));
-    assert!(stops(|| ActionHead::load(
-        &path,
-        &LoadOptions::default().with_config(text)
-    )));
+    let options = LoadOptions {
+        config: Some(text),
+        ..LoadOptions::default()
+    };
+    assert!(stops(|| ActionHead::load(&path, &options)));
 }
 
 /// Asked to stop once the work has come as far as writing tensors.
@@ -44,9 +45,14 @@ fn rewriting_stops_within_a_tensor_and_writes_nothing() {
     let parent = std::env::temp_dir().join(format!("saccade-interruption-{}", std::process::id()));
     std::fs::create_dir_all(&parent).unwrap();
     let out = parent.join("out");
-    let mut rewrite = RewriteOptions::new();
-    rewrite.config = Some(text);
-    let convert_options = ConvertOptions::new(rewrite.clone());
+    let rewrite = RewriteOptions {
+        config: Some(text),
+        ..RewriteOptions::default()
+    };
+    let convert_options = ConvertOptions {
+        rewrite: rewrite.clone(),
+        ..ConvertOptions::default()
+    };
     let resize_options = ResizeOptions::new(rewrite.clone(), 40);
     type Rewrite<'a> = &'a dyn Fn(&mut dyn FnMut()) -> Result<()>;
     let rewrites: [Rewrite<'_>; 3] = [

@@ -36,9 +36,11 @@ fn released(name: &str, threads: usize) -> ActionHead {
     let size = usize::try_from(u64::from_le_bytes(bytes[..8].try_into().unwrap())).unwrap();
     let header: serde_json::Value = serde_json::from_slice(&bytes[8..8 + size]).unwrap();
     let config = header["__metadata__"]["config"].as_str().unwrap().to_owned();
-    let options = LoadOptions::default()
-        .with_config(config)
-        .with_num_threads(threads);
+    let options = LoadOptions {
+        config: Some(config),
+        num_threads: Some(threads),
+        ..LoadOptions::default()
+    };
     ActionHead::load(&path, &options).unwrap()
 }
 
@@ -57,8 +59,10 @@ fn the_second_sample_of_a_shape_allocates_nothing() {
         let features = vec![0.1; 2 * 50 * config.context_dim];
         let image_mask: Vec<_> = (0..2 * 50).map(|token| token % 3 == 1).collect();
         let features_shape = [2, 50, config.context_dim];
-        let features = Features::new(Array::new(&features, &features_shape).unwrap());
-        let features = features.with_image_mask(Array::new(&image_mask, &[2, 50]).unwrap());
+        let features = Features {
+            image_mask: Some(Array::new(&image_mask, &[2, 50]).unwrap()),
+            ..Features::new(Array::new(&features, &features_shape).unwrap())
+        };
         let context = head.encode(&features).unwrap();
         let (state, noise) = (
             vec![0.2; 2 * config.state_dim],
@@ -68,11 +72,19 @@ fn the_second_sample_of_a_shape_allocates_nothing() {
         let shape = [2, horizon, width];
         let mut out = vec![0.0; 2 * 3 * horizon * config.action_dim];
         let mut sample = |future_refresh: Option<usize>, is_chunked: bool| {
-            let chunking = Chunking::new(Array::new(&previous_chunk, &shape).unwrap(), 4, 1, 6.0);
-            let sampling = Sampling::default()
-                .with_num_samples(3)
-                .with_future_refresh(future_refresh)
-                .with_chunking(is_chunked.then_some(chunking));
+            let chunking = Chunking {
+                previous_chunk: Array::new(&previous_chunk, &shape).unwrap(),
+                overlap: 4,
+                frozen: 1,
+                ramp_rate: 6.0,
+                horizon: None,
+            };
+            let sampling = Sampling {
+                num_samples: Some(3),
+                future_refresh,
+                chunking: is_chunked.then_some(chunking),
+                ..Sampling::default()
+            };
             head.sample(
                 &context,
                 Array::new(&state, &[2, config.state_dim]).unwrap(),

@@ -9,7 +9,14 @@ use saccade_vla::{
 
 fn demo() -> ActionHead {
     let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../python/saccade/checkpoints/demo");
-    ActionHead::load(&path, &LoadOptions::default().with_num_threads(1)).unwrap()
+    ActionHead::load(
+        &path,
+        &LoadOptions {
+            num_threads: Some(1),
+            ..LoadOptions::default()
+        },
+    )
+    .unwrap()
 }
 
 #[test]
@@ -39,7 +46,10 @@ fn an_out_of_the_wrong_shape_is_an_error_and_stays_as_it_is() {
             state,
             Array::new(&[0], &[]).unwrap(),
             Array::new(&noise, &[2, 3, horizon, config.encoder_action_dim]).unwrap(),
-            &Sampling::default().with_num_samples(3),
+            &Sampling {
+                num_samples: Some(3),
+                ..Sampling::default()
+            },
             ArrayMut::new(&mut out, &wrong).unwrap(),
         );
         let Err(Error::Shape(problem)) = result else {

@@ -16,9 +16,20 @@ fn demo_path() -> PathBuf {
 }
 
 fn demo() -> Policy {
-    let options = PolicyLoadOptions::default()
-        .with_backbone(BackboneLoadOptions::default().with_num_threads(1))
-        .with_head(LoadOptions::default().with_num_threads(1));
+    let num_threads = Some(1);
+    let backbone = BackboneLoadOptions {
+        num_threads,
+        ..BackboneLoadOptions::default()
+    };
+    let head = LoadOptions {
+        num_threads,
+        ..LoadOptions::default()
+    };
+    let options = PolicyLoadOptions {
+        backbone,
+        head,
+        ..PolicyLoadOptions::default()
+    };
     Policy::load(&demo_path(), &options).unwrap()
 }
 
@@ -32,7 +43,11 @@ fn observation<'a>(pictures: &'a [Vec<u8>], words: &'a str) -> Observation<'a> {
     let views = pictures
         .iter()
         .map(|pixels| (None, Frame::U8(Array::new(pixels, &SHAPE).unwrap())));
-    Observation::new(views.collect()).with_instruction(words)
+    Observation {
+        views: views.collect(),
+        instruction: Some(words),
+        ..Observation::default()
+    }
 }
 
 /// What is sampled for each observation from the same noise, with the state in the middle of its range.
@@ -77,8 +92,10 @@ fn one_call_is_the_parts_one_after_the_other() {
         .iter()
         .map(|&id| id == i64::from(policy.processor().image_token_id()))
         .collect();
-    let given = Features::new(Array::new(features[0].features(0), &shape).unwrap())
-        .with_image_mask(Array::new(&image_mask, &shape[..2]).unwrap());
+    let given = Features {
+        image_mask: Some(Array::new(&image_mask, &shape[..2]).unwrap()),
+        ..Features::new(Array::new(features[0].features(0), &shape).unwrap())
+    };
     let expected = policy.head().encode(&given).unwrap();
 
     let found = policy.encode(&[seen], None).unwrap();

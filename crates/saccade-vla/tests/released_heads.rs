@@ -29,9 +29,11 @@ fn config_of(path: &Path) -> String {
 }
 
 fn released(name: &str) -> ActionHead {
-    let options = LoadOptions::default()
-        .with_config(config_of(&path(name)))
-        .with_num_threads(2);
+    let options = LoadOptions {
+        config: Some(config_of(&path(name))),
+        num_threads: Some(2),
+        ..LoadOptions::default()
+    };
     ActionHead::load(&path(name), &options).unwrap()
 }
 
@@ -75,10 +77,12 @@ fn the_size_is_known_before_loading() {
         let published = HeadCheckpoint::open(&path, Some(&config)).unwrap();
         for precision in [Precision::Float32, Precision::Bfloat16, Precision::Int8] {
             for ids in [vec![1], vec![0, 2]] {
-                let options = LoadOptions::default()
-                    .with_config(config.clone())
-                    .with_precision(precision)
-                    .with_embodiment_ids(ids.clone());
+                let options = LoadOptions {
+                    config: Some(config.clone()),
+                    precision,
+                    embodiment_ids: Some(ids.clone()),
+                    ..LoadOptions::default()
+                };
                 let head = ActionHead::load(&path, &options).unwrap();
                 let expected = published.nbytes(precision, ids.len()).unwrap();
                 assert_eq!(head.nbytes(), expected, "{name}, {precision}");

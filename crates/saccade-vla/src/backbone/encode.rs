@@ -17,7 +17,6 @@ use crate::engine::Kernels;
 use crate::error::{Error, Result, problem};
 use crate::nn::kv_cache;
 use crate::nn::rope::Rope;
-use crate::options::setters;
 
 /// Rows of the language model that are computed together. More read the weights less often; fewer keep the
 /// activations small: at 2048 rows the weights are read once for 7 prompts of one view, and the largest
@@ -26,7 +25,6 @@ const LANGUAGE_ROWS: usize = 2048;
 
 /// The parts of a call to record.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-#[non_exhaustive]
 pub struct BackboneKeep {
     /// The rows after each layer of the language model.
     pub hidden: bool,
@@ -34,17 +32,6 @@ pub struct BackboneKeep {
     pub vision: bool,
     /// The tokens of each view.
     pub image_tokens: bool,
-}
-
-impl BackboneKeep {
-    setters! {
-        /// With or without the rows after each layer of the language model.
-        with_hidden(hidden: bool);
-        /// With or without the patches after the vision tower.
-        with_vision(vision: bool);
-        /// With or without the tokens of each view.
-        with_image_tokens(image_tokens: bool);
-    }
 }
 
 /// A prompt on its way.

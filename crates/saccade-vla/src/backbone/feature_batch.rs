@@ -88,9 +88,11 @@ impl<'a> FeatureBatch<'a> {
     /// are finite, since the backbone did.
     #[must_use]
     pub fn as_features(&self) -> Features<'_> {
-        Features::checked(Array::made(&self.features, &self.shape))
-            .with_attention_mask(self.attention_mask.view())
-            .with_image_mask(self.image_mask.view())
-            .with_drop_vl(self.drop_vl.as_ref().map(OwnedArray::view))
+        Features {
+            attention_mask: Some(self.attention_mask.view()),
+            image_mask: Some(self.image_mask.view()),
+            drop_vl: self.drop_vl.as_ref().map(OwnedArray::view),
+            ..Features::new(Array::finite(&self.features, &self.shape))
+        }
     }
 }

@@ -6,12 +6,10 @@ use super::config::{BackboneConfig, CHANNELS, Tower, VisionConfig};
 use crate::alloc::{collected, filled, reserve};
 use crate::array::{Array, unravel};
 use crate::error::{Error, Result, problem, show_shape};
-use crate::options::setters;
 
 /// The inputs of [`Backbone::encode`](super::model::Backbone::encode), as the released processors prepare
 /// them.
 #[derive(Clone, Debug)]
-#[non_exhaustive]
 pub struct BackboneInputs<'a> {
     /// The normalised pixels of all views, those of the first prompt first: arrays
     /// `(views, 3, height, width)`, whose sizes may differ, or for N1.7 one of patches, `(patches, values)`.
@@ -34,13 +32,6 @@ impl<'a> BackboneInputs<'a> {
             attention_mask: None,
             image_grid_thw: None,
         }
-    }
-
-    setters! {
-        /// With this mask of padding.
-        with_attention_mask(attention_mask: impl Into<Option<Array<'a, bool>>>);
-        /// With these grids of patches.
-        with_image_grid_thw(image_grid_thw: impl Into<Option<Array<'a, i64>>>);
     }
 }
 

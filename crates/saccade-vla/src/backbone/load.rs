@@ -15,18 +15,10 @@ use crate::nn::source::file::FileSource;
 use crate::nn::source::memory::{self, MemorySource, TensorViews};
 use crate::nn::source::planner::plan;
 use crate::nn::weights::Builder;
-use crate::options::setters;
 use crate::precision::Precision;
 
 /// Options of loading a backbone.
-///
-/// ```
-/// use saccade_vla::{BackboneLoadOptions, Precision};
-/// let options = BackboneLoadOptions::default().with_precision(Precision::Int8).with_num_threads(4);
-/// assert_eq!(options.num_threads, Some(4));
-/// ```
 #[derive(Clone, Debug, Default)]
-#[non_exhaustive]
 pub struct BackboneLoadOptions {
     /// The config as JSON; default the `config.json` in the checkpoint's directory, if it is there.
     pub config: Option<String>,
@@ -35,17 +27,6 @@ pub struct BackboneLoadOptions {
     /// Threads that a call uses; default `SACCADE_NUM_THREADS`, or the physical cores that the process may
     /// use.
     pub num_threads: Option<usize>,
-}
-
-impl BackboneLoadOptions {
-    setters! {
-        /// With this config, as JSON.
-        with_config(config: impl Into<Option<String>>);
-        /// With this precision.
-        with_precision(precision: Precision);
-        /// With this number of threads.
-        with_num_threads(num_threads: impl Into<Option<usize>>);
-    }
 }
 
 impl Backbone {

@@ -12,11 +12,9 @@ use crate::config::Reads;
 use crate::engine::Kernels;
 use crate::error::{Error, Result, problem, show_shape};
 use crate::inspect::trace::Keep;
-use crate::options::setters;
 
 /// The observation given to [`ActionHead::encode`].
 #[derive(Clone, Copy, Debug)]
-#[non_exhaustive]
 pub struct Features<'a> {
     /// `(batch, num_vl_tokens, context_dim)`.
     pub backbone_features: Array<'a>,
@@ -30,8 +28,6 @@ pub struct Features<'a> {
     pub drop_vl: Option<Array<'a, bool>>,
     /// The parts of the VL self-attention to record.
     pub record: Keep,
-    /// Features that were found to be finite. They are not looked through again if they are the ones given.
-    finite: Option<&'a [f32]>,
 }
 
 impl<'a> Features<'a> {
@@ -44,27 +40,7 @@ impl<'a> Features<'a> {
             image_mask: None,
             drop_vl: None,
             record: Keep::default(),
-            finite: None,
         }
-    }
-
-    /// Features that a backbone made, and found to be finite.
-    pub(crate) fn checked(backbone_features: Array<'a>) -> Self {
-        Self {
-            finite: Some(backbone_features.data()),
-            ..Self::new(backbone_features)
-        }
-    }
-
-    setters! {
-        /// With this mask of attended positions.
-        with_attention_mask(attention_mask: impl Into<Option<Array<'a, bool>>>);
-        /// With this mask of image tokens.
-        with_image_mask(image_mask: impl Into<Option<Array<'a, bool>>>);
-        /// With this mask of positions to remove.
-        with_drop_vl(drop_vl: impl Into<Option<Array<'a, bool>>>);
-        /// Keeping this of the VL self-attention.
-        with_record(record: Keep);
     }
 
     fn is_image(&self, token: usize) -> bool {
@@ -88,8 +64,10 @@ impl ActionHead {
     /// let shape = [2, 20, head.config().context_dim]; // two observations of 20 tokens
     /// let tokens = vec![0.1; shape.iter().product()];
     /// let padding: Vec<bool> = (0..40).map(|token| token < 5).collect();
-    /// let features = Features::new(Array::new(&tokens, &shape)?)
-    ///     .with_drop_vl(Array::new(&padding, &shape[..2])?);
+    /// let features = Features {
+    ///     drop_vl: Some(Array::new(&padding, &shape[..2])?),
+    ///     ..Features::new(Array::new(&tokens, &shape)?)
+    /// };
     /// let context = head.encode(&features)?;
     /// assert_eq!((context.batch(), context.num_vl_tokens()), (2, 20));
     /// # Ok::<(), saccade_vla::Error>(())
@@ -160,12 +138,7 @@ impl ActionHead {
                 got "{}", show_shape(array.shape())
             )));
         }
-        if !features
-            .finite
-            .is_some_and(|finite| std::ptr::eq(finite, array.data()))
-        {
-            array.check_finite("backbone_features")?;
-        }
+        array.check_finite("backbone_features")?;
         let masks = [
             ("attention_mask", features.attention_mask),
             ("image_mask", features.image_mask),

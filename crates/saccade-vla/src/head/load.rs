@@ -17,7 +17,6 @@ use crate::nn::source::Source;
 use crate::nn::source::file::FileSource;
 use crate::nn::source::memory::{self, MemorySource, TensorViews};
 use crate::nn::weights::Builder;
-use crate::options::setters;
 use crate::precision::Precision;
 use crate::recognise::HeadCheckpoint;
 
@@ -25,11 +24,10 @@ use crate::recognise::HeadCheckpoint;
 ///
 /// ```
 /// use saccade_vla::{LoadOptions, Precision};
-/// let options = LoadOptions::default().with_precision(Precision::Int8).with_num_threads(4);
-/// assert_eq!(options.num_threads, Some(4));
+/// let options = LoadOptions { precision: Precision::Int8, num_threads: Some(4), ..LoadOptions::default() };
+/// assert_eq!(options.embodiment_ids, None);
 /// ```
 #[derive(Clone, Debug, Default)]
-#[non_exhaustive]
 pub struct LoadOptions {
     /// The config as JSON; default the `config.json` in the checkpoint's directory.
     pub config: Option<String>,
@@ -49,21 +47,6 @@ pub struct LoadOptions {
 }
 
 impl LoadOptions {
-    setters! {
-        /// With this config, as JSON.
-        with_config(config: impl Into<Option<String>>);
-        /// With these embodiments only.
-        with_embodiment_ids(embodiment_ids: impl Into<Option<Vec<i64>>>);
-        /// With this number of actions in a chunk.
-        with_action_horizon(action_horizon: impl Into<Option<usize>>);
-        /// With this number of states in an observation.
-        with_num_states(num_states: impl Into<Option<usize>>);
-        /// With this precision.
-        with_precision(precision: Precision);
-        /// With this number of threads.
-        with_num_threads(num_threads: impl Into<Option<usize>>);
-    }
-
     /// The head's config with the actions and states that were asked for.
     fn rows_of(&self, mut config: HeadConfig) -> Result<HeadConfig> {
         if let Some(action_horizon) = self.action_horizon {
@@ -82,7 +65,7 @@ impl ActionHead {
     ///
     /// ```
     /// use saccade_vla::{ActionHead, LoadOptions, Precision};
-    /// let options = LoadOptions::default().with_precision(Precision::Bfloat16).with_num_threads(1);
+    /// let options = LoadOptions { precision: Precision::Bfloat16, num_threads: Some(1), ..LoadOptions::default() };
     /// let head = ActionHead::load("examples/tiny".as_ref(), &options)?;
     /// assert_eq!((head.config().num_layers, head.engine().threads), (2, 1));
     /// # Ok::<(), saccade_vla::Error>(())

@@ -9,7 +9,6 @@ use crate::error::{Error, Result, problem};
 use crate::inspect::changes::Changes;
 use crate::inspect::intervention::Intervention;
 use crate::inspect::trace::Recorded;
-use crate::options::setters;
 use crate::sampling::chunking::Chunking;
 use crate::sampling::integrator::Integrator;
 
@@ -17,11 +16,10 @@ use crate::sampling::integrator::Integrator;
 ///
 /// ```
 /// use saccade_vla::{Integrator, Sampling};
-/// let sampling = Sampling::default().with_num_steps(8).with_integrator(Integrator::Midpoint);
-/// assert_eq!((sampling.num_steps, sampling.num_samples), (Some(8), None));
+/// let sampling = Sampling { num_steps: Some(8), integrator: Integrator::Midpoint, ..Sampling::default() };
+/// assert_eq!(sampling.num_samples, None);
 /// ```
 #[derive(Clone, Copy, Debug, Default)]
-#[non_exhaustive]
 pub struct Sampling<'a> {
     /// Steps, 1 to `num_timestep_buckets`; default the config's.
     pub num_steps: Option<usize>,
@@ -38,23 +36,6 @@ pub struct Sampling<'a> {
     /// Changes inside the head. Cuts and biases act on the rows that run; a patch of rows that do not is an
     /// error.
     pub interventions: &'a [Intervention],
-}
-
-impl<'a> Sampling<'a> {
-    setters! {
-        /// With this number of steps.
-        with_num_steps(num_steps: impl Into<Option<usize>>);
-        /// With this integrator.
-        with_integrator(integrator: Integrator);
-        /// With this number of chunks for each observation.
-        with_num_samples(num_samples: impl Into<Option<usize>>);
-        /// Running the rows of state and future tokens at every `future_refresh`-th evaluation only.
-        with_future_refresh(future_refresh: impl Into<Option<usize>>);
-        /// Beginning with the end of the previous chunk.
-        with_chunking(chunking: impl Into<Option<Chunking<'a>>>);
-        /// With these changes.
-        with_interventions(interventions: &'a [Intervention]);
-    }
 }
 
 impl ActionHead {
@@ -76,7 +57,7 @@ impl ActionHead {
     /// let noise = vec![0.5; noise_shape.iter().product()];
     /// let noise = Array::new(&noise, &noise_shape)?;
     /// // Three chunks in two steps each.
-    /// let sampling = Sampling::default().with_num_samples(3).with_num_steps(2);
+    /// let sampling = Sampling { num_samples: Some(3), num_steps: Some(2), ..Sampling::default() };
     /// let mut actions = vec![0.0; 3 * config.action_horizon * config.action_dim];
     /// let shape = [1, 3, config.action_horizon, config.action_dim];
     /// let out = ArrayMut::new(&mut actions, &shape)?;

@@ -21,9 +21,11 @@ fn released(name: &str) -> ActionHead {
     let path = Path::new(env!("CARGO_MANIFEST_DIR"))
         .join("../../tests/data")
         .join(name);
-    let options = LoadOptions::default()
-        .with_config(config_of(&path))
-        .with_num_threads(2);
+    let options = LoadOptions {
+        config: Some(config_of(&path)),
+        num_threads: Some(2),
+        ..LoadOptions::default()
+    };
     ActionHead::load(&path, &options).unwrap()
 }
 
@@ -51,8 +53,12 @@ fn context(head: &ActionHead, batch: usize) -> Context {
     let features = numbers(shape.iter().product(), 1);
     let image_mask: Vec<_> = (0..batch * 9).map(|token| token % 3 == 1).collect();
     let features = Features::new(Array::new(&features, &shape).unwrap());
-    head.encode(&features.with_image_mask(Array::new(&image_mask, &shape[..2]).unwrap()))
-        .unwrap()
+    let image_mask = Some(Array::new(&image_mask, &shape[..2]).unwrap());
+    head.encode(&Features {
+        image_mask,
+        ..features
+    })
+    .unwrap()
 }
 
 /// One velocity with all rows, or only the needed ones, in the last block.

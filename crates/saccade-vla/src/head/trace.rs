@@ -25,7 +25,8 @@ impl ActionHead {
     /// # let head = ActionHead::load("examples/tiny".as_ref(), &LoadOptions::default())?;
     /// # let context = head.encode(&Features::new(Array::new(&[0.1; 640], &[1, 20, 32])?))?;
     /// # let (state, noise) = (Array::new(&[0.0; 8], &[1, 8])?, Array::new(&[0.5; 128], &[1, 16, 8])?);
-    /// let options = TraceOptions::new(Keep::default().with_attention(true));
+    /// let record = Keep { attention: true, ..Keep::default() };
+    /// let options = TraceOptions { record, ..TraceOptions::default() };
     /// let trace = head.trace(&context, state, Array::new(&[0], &[])?, noise, &Sampling::default(), &options)?;
     /// let attention = &trace.recorded.attention[&(0, 0)]; // of the first step and block
     /// assert_eq!(attention.shape()[0], 1); // (batch, heads, queries, keys)

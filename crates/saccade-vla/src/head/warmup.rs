@@ -59,7 +59,11 @@ impl ActionHead {
         let tokens = batch * num_vl_tokens;
         let image_mask = collected("masks", tokens, (0..tokens).map(is_image))?;
         let features = Features::new(Array::new(&features, &sizes)?);
-        let context = self.encode(&features.with_image_mask(Array::new(&image_mask, &sizes[..2])?))?;
+        let image_mask = Some(Array::new(&image_mask, &sizes[..2])?);
+        let context = self.encode(&Features {
+            image_mask,
+            ..features
+        })?;
         let state_shape = [batch, config.num_states, config.state_dim];
         let state = filled("state", product("state", &state_shape)?, 0.0)?;
         for &id in &self.embodiment_ids {
@@ -74,9 +78,11 @@ impl ActionHead {
             Array::new(&state, &state_shape)?,
             Array::new(&embodiment_id, &[])?,
             Array::new(&noise, &shape)?,
-            &Sampling::default()
-                .with_num_samples(num_samples)
-                .with_future_refresh(future_refresh),
+            &Sampling {
+                num_samples,
+                future_refresh,
+                ..Sampling::default()
+            },
             ArrayMut::new(&mut out, &out_shape)?,
         )
     }

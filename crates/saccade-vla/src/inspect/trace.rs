@@ -7,11 +7,9 @@ use crate::alloc::reserve;
 use crate::array::OwnedArray;
 use crate::error::{Error, Result, problem};
 use crate::ops::check_interrupted;
-use crate::options::setters;
 
 /// What to keep.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-#[non_exhaustive]
 pub struct Keep {
     /// Attention probabilities.
     pub attention: bool,
@@ -19,18 +17,8 @@ pub struct Keep {
     pub hidden: bool,
 }
 
-impl Keep {
-    setters! {
-        /// Whether to keep attention probabilities.
-        with_attention(attention: bool);
-        /// Whether to keep the rows after a block.
-        with_hidden(hidden: bool);
-    }
-}
-
 /// What [`ActionHead::trace`](crate::ActionHead::trace) keeps, and how much of it at most.
 #[derive(Clone, Debug)]
-#[non_exhaustive]
 pub struct TraceOptions {
     /// What to keep.
     pub record: Keep,
@@ -148,27 +136,19 @@ pub struct Trace {
 /// What is kept by default at most.
 const MAX_BYTES: u64 = 1 << 31;
 
-impl TraceOptions {
-    /// Keeps `record` of all blocks and steps, 2 GiB of it at most.
-    #[must_use]
-    pub fn new(record: Keep) -> Self {
+impl Default for TraceOptions {
+    /// Keeps nothing, of all blocks and steps, and 2 GiB at most.
+    fn default() -> Self {
         Self {
-            record,
+            record: Keep::default(),
             blocks: None,
             steps: None,
             max_bytes: MAX_BYTES,
         }
     }
+}
 
-    setters! {
-        /// Of these blocks only; `None` means all.
-        with_blocks(blocks: impl Into<Option<Vec<usize>>>);
-        /// Of these Euler steps only; `None` means all.
-        with_steps(steps: impl Into<Option<Vec<usize>>>);
-        /// At most this many bytes.
-        with_max_bytes(max_bytes: u64);
-    }
-
+impl TraceOptions {
     /// The steps and blocks that are kept, of `num_steps` steps and `num_layers` blocks.
     ///
     /// # Errors

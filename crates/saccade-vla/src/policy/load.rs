@@ -7,7 +7,6 @@ use crate::backbone::{Backbone, BackboneLoadOptions};
 use crate::error::Result;
 use crate::head::action_head::ActionHead;
 use crate::head::load::LoadOptions;
-use crate::options::setters;
 use crate::processor::{ProcessorSource, TokenizerFiles};
 use crate::release::Preprocessing;
 
@@ -15,12 +14,11 @@ use crate::release::Preprocessing;
 ///
 /// ```
 /// use saccade_vla::{BackboneLoadOptions, PolicyLoadOptions, Precision};
-/// let backbone = BackboneLoadOptions::default().with_precision(Precision::Int8);
-/// let options = PolicyLoadOptions::default().with_backbone(backbone);
+/// let backbone = BackboneLoadOptions { precision: Precision::Int8, ..BackboneLoadOptions::default() };
+/// let options = PolicyLoadOptions { backbone, ..PolicyLoadOptions::default() };
 /// assert_eq!(options.head.precision, Precision::Float32);
 /// ```
 #[derive(Clone, Debug, Default)]
-#[non_exhaustive]
 pub struct PolicyLoadOptions {
     /// How the backbone is loaded.
     pub backbone: BackboneLoadOptions,
@@ -32,21 +30,6 @@ pub struct PolicyLoadOptions {
     pub preprocessing: Option<Preprocessing>,
     /// Options of the processor, a JSON object, in place of the checkpoint's.
     pub processor: Option<String>,
-}
-
-impl PolicyLoadOptions {
-    setters! {
-        /// With these options of the backbone.
-        with_backbone(backbone: BackboneLoadOptions);
-        /// With these options of the action head.
-        with_head(head: LoadOptions);
-        /// With this tokenizer.
-        with_tokenizer(tokenizer: impl Into<Option<PathBuf>>);
-        /// Following the preprocessing of this program.
-        with_preprocessing(preprocessing: impl Into<Option<Preprocessing>>);
-        /// With these options of the processor, as JSON.
-        with_processor(processor: impl Into<Option<String>>);
-    }
 }
 
 impl Policy {

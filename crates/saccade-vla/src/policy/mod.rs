@@ -27,7 +27,8 @@ pub use load::PolicyLoadOptions;
 /// let policy = Policy::load("checkpoint".as_ref(), &PolicyLoadOptions::default())?;
 /// let pixels = vec![0; 480 * 640 * 3];
 /// let frame = Frame::U8(Array::new(&pixels, &[480, 640, 3])?);
-/// let seen = [Observation::new(vec![(Some("front"), frame)]).with_instruction("open the drawer")];
+/// let views = vec![(Some("front"), frame)];
+/// let seen = [Observation { views, instruction: Some("open the drawer"), ..Observation::default() }];
 /// let context = policy.encode(&seen, None)?;
 /// let next = policy.encode(&seen, Some(&context))?; // the same frame is not encoded again
 /// assert_eq!(next.batch(), 1);
@@ -175,8 +176,11 @@ impl Prepared {
     #[must_use]
     pub fn as_inputs(&self) -> BackboneInputs<'_> {
         let pixel_values = self.pixel_values.iter().map(|pixels| pixels.view()).collect();
-        BackboneInputs::new(pixel_values, self.input_ids.view())
-            .with_attention_mask(self.attention_mask.view())
-            .with_image_grid_thw(self.image_grid_thw.as_ref().map(|grid| grid.view()))
+        BackboneInputs {
+            pixel_values,
+            input_ids: self.input_ids.view(),
+            attention_mask: Some(self.attention_mask.view()),
+            image_grid_thw: self.image_grid_thw.as_ref().map(|grid| grid.view()),
+        }
     }
 }

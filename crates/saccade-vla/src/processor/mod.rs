@@ -44,26 +44,6 @@ pub struct Observation<'a> {
     pub plain_text: bool,
 }
 
-impl<'a> Observation<'a> {
-    /// Frames with the names of their cameras, without an instruction.
-    #[must_use]
-    pub fn new(views: Vec<(Option<&'a str>, Frame<'a>)>) -> Self {
-        Self {
-            views,
-            ..Self::default()
-        }
-    }
-
-    /// With this instruction.
-    #[must_use]
-    pub fn with_instruction(self, instruction: impl Into<Option<&'a str>>) -> Self {
-        Self {
-            instruction: instruction.into(),
-            ..self
-        }
-    }
-}
-
 /// Inputs of a backbone, of a batch of observations.
 #[derive(Clone, Debug)]
 #[non_exhaustive]

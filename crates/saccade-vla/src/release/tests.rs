@@ -115,8 +115,10 @@ fn a_made_up_release_needs_its_row_only() {
     let shape = [1, batch[1], features.feature_dim()];
     let image = i64::from(processor.image_token_id());
     let is_image: Vec<bool> = prepared.input_ids.data().iter().map(|id| *id == image).collect();
-    let features = Features::new(Array::new(&rows, &shape).unwrap())
-        .with_image_mask(Array::new(&is_image, batch).unwrap());
+    let features = Features {
+        image_mask: Some(Array::new(&is_image, batch).unwrap()),
+        ..Features::new(Array::new(&rows, &shape).unwrap())
+    };
     let context = head.encode(&features).unwrap();
     let mut actions = [f32::NAN; 24];
     head.sample(

@@ -19,7 +19,6 @@ use crate::rewrite::{RewriteOptions, SourceCheckpoint, Written};
 
 /// How a checkpoint is converted.
 #[derive(Clone, Debug, Default)]
-#[non_exhaustive]
 pub struct ConvertOptions {
     /// Options that all rewriting shares.
     pub rewrite: RewriteOptions,
@@ -32,17 +31,6 @@ pub struct ConvertOptions {
     /// The directory of a LoRA adapter to merge into the weights, in their type in the copy. Its statistics and processors take the place of the
     /// source's, and so does its `config.json`, unless the options have one.
     pub adapter: Option<PathBuf>,
-}
-
-impl ConvertOptions {
-    /// A copy by these rules that changes nothing else, to be changed field by field.
-    #[must_use]
-    pub fn new(rewrite: RewriteOptions) -> Self {
-        Self {
-            rewrite,
-            ..Self::default()
-        }
-    }
 }
 
 /// What [`convert`] wrote.
@@ -81,9 +69,8 @@ pub struct ConvertReport {
 ///
 /// ```
 /// # let out = std::env::temp_dir().join(format!("saccade-convert-{}", std::process::id()));
-/// use saccade_vla::{ConvertOptions, Float, RewriteOptions, convert};
-/// let mut options = ConvertOptions::new(RewriteOptions::default());
-/// options.dtype = Some(Float::F32);
+/// use saccade_vla::{ConvertOptions, Float, convert};
+/// let options = ConvertOptions { dtype: Some(Float::F32), ..ConvertOptions::default() };
 /// let report = convert("examples/tiny".as_ref(), &out, &options, |_, _| true)?;
 /// assert!(report.bytes_after > report.bytes_before);
 /// # std::fs::remove_dir_all(&out).ok();

@@ -28,7 +28,6 @@ const MAX_SHARD_BYTES: u64 = 5_000_000_000;
 
 /// How a checkpoint is written from another.
 #[derive(Clone, Debug, Default)]
-#[non_exhaustive]
 pub struct RewriteOptions {
     /// The source's config as JSON; default the `config.json` next to the weights.
     pub config: Option<String>,
@@ -42,14 +41,6 @@ pub struct RewriteOptions {
     pub metadata: BTreeMap<String, String>,
     /// The largest size of a file, unless a single tensor is larger. Default: no limit if the source is one file, otherwise 5 GB.
     pub max_shard_bytes: Option<u64>,
-}
-
-impl RewriteOptions {
-    /// The defaults, to be changed field by field.
-    #[must_use]
-    pub fn new() -> Self {
-        Self::default()
-    }
 }
 
 /// What was written.

@@ -5,12 +5,10 @@ use saccade_vla_kernels::{Rows, RowsMut};
 use crate::array::Array;
 use crate::config::HeadConfig;
 use crate::error::{Error, Result, problem, show_shape};
-use crate::options::setters;
 
 /// The chunk before, and how it is taken over. Of its first `horizon` actions the last `overlap` become the first ones of the new chunk, without
 /// noise: the first `frozen` of these stay as they are, the rest follow the velocity the more, the later they come.
 #[derive(Clone, Copy, Debug)]
-#[non_exhaustive]
 pub struct Chunking<'a> {
     /// `(batch, rows, encoder_action_dim)` with at least `horizon` rows, as they left the head; or `action_dim` wide.
     pub previous_chunk: Array<'a>,
@@ -38,23 +36,6 @@ pub(crate) struct Seam<'a> {
 }
 
 impl<'a> Chunking<'a> {
-    /// Continues `previous_chunk`, all of whose `action_horizon` actions count.
-    #[must_use]
-    pub fn new(previous_chunk: Array<'a>, overlap: usize, frozen: usize, ramp_rate: f64) -> Self {
-        Self {
-            previous_chunk,
-            overlap,
-            frozen,
-            ramp_rate,
-            horizon: None,
-        }
-    }
-
-    setters! {
-        /// With this number of actions of the previous chunk.
-        with_horizon(horizon: impl Into<Option<usize>>);
-    }
-
     /// # Errors
     /// [`Error::Shape`] and [`Error::Input`] for numbers or a chunk that do not fit the head.
     pub(crate) fn check(&self, config: &HeadConfig, batch: usize) -> Result<Seam<'a>> {

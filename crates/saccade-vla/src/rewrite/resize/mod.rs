@@ -26,7 +26,6 @@ pub use merge::{MergedTokens, merge_future_tokens};
 
 /// How a checkpoint is resized.
 #[derive(Clone, Debug)]
-#[non_exhaustive]
 pub struct ResizeOptions {
     /// Options that all rewriting shares.
     pub rewrite: RewriteOptions,
@@ -39,7 +38,7 @@ pub struct ResizeOptions {
 }
 
 impl ResizeOptions {
-    /// A copy with this number of future tokens and nothing added to them, to be changed field by field.
+    /// A copy with this number of future tokens and nothing added to them.
     #[must_use]
     pub fn new(rewrite: RewriteOptions, num_future_tokens: usize) -> Self {
         Self {
