@@ -28,7 +28,7 @@ PROJECTS = {"saccade-vla": ROOT / "pyproject.toml", "saccade-vla-lab": ROOT / "l
 #: File -> the distributions with their extras, and the groups of pyproject.toml, that it serves. dev comes
 #: first: its versions hold for the others. That of wheels is apart, because what it has was tested together.
 FILES: dict[str, tuple[list[str], list[str]]] = {
-    "dev": (["saccade-vla[serve,torch,hub]", "saccade-vla-lab[study]"], ["dev"]),
+    "dev": (["saccade-vla[serve,torch,hub,data]", "saccade-vla-lab[study]"], ["dev"]),
     "nox": ([], ["nox"]),
     "core": (["saccade-vla"], ["build", "test"]),
     "rollout": (["saccade-vla-lab[sim]"], ["build"]),

@@ -2,7 +2,7 @@
 
 Public are the names of ``__all__``, the submodules in ``_SUBMODULES``, and what each of them lists. All needs
 NumPy only, but :func:`accelerate` and :mod:`saccade.torch`, which work on torch's policies, and
-:mod:`saccade.serve`.
+:mod:`saccade.datasets` and :mod:`saccade.serve`.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from saccade.backbone.features import BackboneFeatures, BackboneRecord
 from saccade.backbone.inputs import BackboneInputs
 from saccade.errors import (
     CheckpointError,
+    DatasetError,
     DtypeError,
     InputError,
     MissingExtraError,
@@ -51,6 +52,7 @@ __all__ = [
     "Chunking",
     "Context",
     "CrossAttention",
+    "DatasetError",
     "DtypeError",
     "HeadConfig",
     "InputError",
@@ -81,7 +83,16 @@ _FUNCTIONS = {
     "accelerate": "saccade.integrations",
 }
 #: Public submodules, likewise.
-_SUBMODULES = ("checkpoints", "integrations", "linalg", "observations", "robots", "serve", "torch")
+_SUBMODULES = (
+    "checkpoints",
+    "datasets",
+    "integrations",
+    "linalg",
+    "observations",
+    "robots",
+    "serve",
+    "torch",
+)
 
 # Hidden from type checkers, so that they report names that do not exist; they need `import saccade.serve`.
 if not TYPE_CHECKING:

@@ -31,6 +31,13 @@ class CheckpointError(SaccadeError, ValueError):
     """
 
 
+class DatasetError(SaccadeError, ValueError):
+    """A recorded data set is damaged, contradicts itself or is of an unknown kind.
+
+    The message names the file, and episode and step where they are known.
+    """
+
+
 class MissingExtraError(SaccadeError, ModuleNotFoundError):
     """An optional dependency is not installed. The message contains a command that installs it.
 

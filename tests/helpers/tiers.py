@@ -1,9 +1,9 @@
 """The tier of a test module, from what it imports: `core`, `torch` or `lab`.
 
 `core` needs the wheel, NumPy, pytest and Hypothesis. `torch` also needs torch, the reference implementation
-of the model, the server's packages, or programs that saccade is compared with. `lab` needs the rest of
-saccade_lab, or the programs of `benches`. A module belongs to the highest tier of what it and its helpers
-import, also inside functions, and of its folder: some tests run programs that import more.
+of the model, the packages of the server and of data sets, or programs that saccade is compared with. `lab`
+needs the rest of saccade_lab, or the programs of `benches`. A module belongs to the highest tier of what it
+and its helpers import, also inside functions, and of its folder: some tests run programs that import more.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ PACKAGES = {
         ("diffusers", "lerobot", "lerobot_policy_saccade", "safetensors", "scipy", "torch", "transformers"),
         "torch",
     ),
+    **dict.fromkeys(("av", "pyarrow", "saccade.datasets"), "torch"),
     **dict.fromkeys(("griffe", "huggingface_hub", "msgpack", "saccade.serve", "tokenizers", "zmq"), "torch"),
     **dict.fromkeys(("saccade.integrations", "saccade.torch", "saccade_lab.reference"), "torch"),
     "saccade_lab.random_checkpoint": "core",

@@ -98,9 +98,10 @@ SACCADE = Extras(
         "cli": {"rich": "rich>=13", "PIL": "pillow>=10"},
         "torch": {"torch": "torch>=2.4", "safetensors": "safetensors>=0.4"},
         "serve": {"zmq": "pyzmq>=25", "msgpack": "msgpack>=1.0"},
+        "data": {"pyarrow": "pyarrow>=17", "av": "av>=14"},
         "hub": {"huggingface_hub": "huggingface_hub>=0.25"},
     },
-    {"serve": ("cli",)},
+    {"serve": ("cli",), "data": ("cli",)},
 )
 
 

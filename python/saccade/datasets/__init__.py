@@ -1,0 +1,17 @@
+"""Recorded data sets: LeRobotDataset v2.0, v2.1 and v3.0, with Isaac-GR00T's ``modality.json`` or without.
+
+:func:`open` opens one. Needs the extra ``data``.
+
+- ``opening``, ``source``: the folder, and what it is read as.
+- ``metadata`` with ``features``: what the data set says about itself, in any version.
+- ``modality``, ``selection``: which numbers and cameras the keys are, and which of them a policy takes.
+- ``dataset`` with ``parquet``, ``videos`` and ``forms``: steps, frames and observations.
+- ``statistics``: by lerobot's rules.
+"""
+
+from saccade.datasets.dataset import Dataset
+from saccade.datasets.features import Episode
+from saccade.datasets.opening import open
+from saccade.datasets.videos import Frame
+
+__all__ = ["Dataset", "Episode", "Frame", "open"]

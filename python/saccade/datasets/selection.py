@@ -1,0 +1,110 @@
+"""Which keys and steps a policy takes from a data set: from a data config, or all of them, now."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, TypeAlias
+
+from saccade.datasets.modality import Modality
+from saccade.errors import InputError
+from saccade.robots import DataConfigLike
+from saccade.robots.data_configs import data_config
+
+KINDS = ("video", "state", "action", "language")
+
+#: As :class:`saccade.Normalizer` takes it, or the modality configs of N1.6 and N1.7.
+SelectionLike: TypeAlias = "DataConfigLike | Mapping[str, Any]"
+
+
+@dataclass(frozen=True)
+class Part:
+    """Keys of one modality, and the steps that are taken of each, relative to the present one."""
+
+    keys: tuple[str, ...]
+    indices: tuple[int, ...] | None
+
+
+@dataclass(frozen=True)
+class Selection:
+    """What a policy takes. ``indices`` of actions are None if nothing says which."""
+
+    video: Part
+    state: Part
+    action: Part
+    language: str | None
+
+
+def read_selection(given: SelectionLike | None, modality: Modality) -> Selection:
+    """The selection of a data config. Without one, all keys of the data set, and the present step.
+
+    Args:
+        given: A data config of N1.5, as :class:`saccade.Normalizer` takes it; or modality configs of N1.6 and
+            N1.7, ``{"video": {"delta_indices": [0], "modality_keys": ["front"]}, ...}``.
+        modality: The keys of the data set.
+
+    Raises:
+        FileNotFoundError, CheckpointError, InputError: As of ``data_config``. Or a key is not in the data
+            set; the message lists all of them.
+    """
+    if given is None:
+        found = Selection(
+            Part(tuple(modality.video), (0,)),
+            Part(tuple(modality.state), (0,)),
+            Part(tuple(modality.action), None),
+            None,
+        )
+    elif isinstance(given, Mapping) and given and set(given) <= set(KINDS):
+        found = _from_configs(given)
+    else:
+        config = data_config(given)
+        steps = config.observation_indices
+        found = Selection(
+            Part(config.keys("video"), steps),
+            Part(config.keys("state"), steps),
+            Part(config.keys("action"), config.action_indices),
+            config.language_keys[0] if config.language_keys else None,
+        )
+    missing = [
+        f"{kind}.{key}"
+        for kind, there in (("video", modality.video), ("state", modality.state), ("action", modality.action))
+        for key in getattr(found, kind).keys
+        if key not in there
+    ]
+    if found.language is not None and found.language not in modality.language:
+        missing.append(found.language)
+    if missing:
+        names = [f"{kind}.{key}" for kind in KINDS[:3] for key in getattr(modality, kind)]
+        raise InputError(
+            f"data_config: {', '.join(missing)}: not in {modality.where}, which has "
+            f"{', '.join([*names, *modality.language])}"
+        )
+    return found
+
+
+def _from_configs(given: Mapping[str, Any]) -> Selection:
+    """The selection of modality configs of N1.6 and N1.7."""
+    parts = {}
+    for kind in KINDS:
+        about = given.get(kind, {"delta_indices": [0], "modality_keys": []})
+        keys = about.get("modality_keys") if isinstance(about, Mapping) else None
+        steps = about.get("delta_indices") if isinstance(about, Mapping) else None
+        if keys is None or not _all(keys, str) or not steps or not _all(steps, int):
+            raise InputError(
+                f"data_config: {kind}: expected modality_keys and delta_indices, got {about!r:.100}"
+            )
+        parts[kind] = Part(tuple(keys), tuple(steps))
+    language = parts["language"]
+    if len(language.keys) > 1 or language.indices != (0,):
+        raise InputError(
+            "data_config: language: expected one key and the step 0, as the released loader does"
+        )
+    return Selection(parts["video"], parts["state"], parts["action"], next(iter(language.keys), None))
+
+
+def _all(values: Any, kind: type) -> bool:
+    return (
+        isinstance(values, Sequence)
+        and not isinstance(values, str)
+        and all(type(one) is kind for one in values)
+    )

@@ -1,0 +1,152 @@
+"""Frames of videos by their time, without decoding a whole video. Decoding is PyAV's, as in lerobot."""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections import OrderedDict
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, cast
+
+import numpy as np
+
+from saccade._internal.arrays import UInt8Array
+from saccade._internal.extras import SACCADE
+from saccade.errors import DatasetError
+
+if TYPE_CHECKING:
+    import av
+
+#: lerobot's: seconds by which the time of a frame may differ from the time of the step.
+TOLERANCE = 1e-4
+#: Videos that stay open. Each keeps a decoder, some megabytes.
+MOST_OPEN = 8
+#: Up to so many frames are decoded to reach a later one. For more, decoding starts at a keyframe.
+MOST_AHEAD = 16
+
+
+@dataclass(frozen=True)
+class Frame:
+    """A frame of a camera.
+
+    Attributes:
+        pixels: ``(height, width, 3)`` uint8, red, green and blue.
+        timestamp: Its time in the episode, seconds, as the video has it.
+    """
+
+    pixels: UInt8Array
+    timestamp: float
+
+
+class Videos:
+    """Open videos. Any number of threads may call it; they decode one after the other."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._open: OrderedDict[Path, _Video] = OrderedDict()
+        self._process = os.getpid()
+
+    def frame(self, where: str, path: Path, time: float, start: float) -> Frame:
+        """The frame at a time.
+
+        Args:
+            where: What messages begin with.
+            path: The video.
+            time: Seconds since the start of the video.
+            start: Time of the episode's first frame in the video.
+
+        Raises:
+            DatasetError: There is no frame at this time, or the video is damaged.
+        """
+        with self._lock:
+            if self._process != os.getpid():  # after a fork both processes would move one file position
+                self._open, self._process = OrderedDict(), os.getpid()
+            try:
+                video = self._open.pop(path, None) or _Video(path)
+                self._open[path] = video
+                found = video.frame(time)
+            except _errors() as error:
+                self._forget(path)
+                raise DatasetError(f"{where}: {path} cannot be decoded: {error}") from None
+            while len(self._open) > MOST_OPEN:
+                self._forget(next(iter(self._open)))
+        if isinstance(found, float):
+            raise DatasetError(
+                f"{where}: {path}: expected a frame at {time:.6f} s (within {TOLERANCE} s), got "
+                + ("none" if np.isinf(found) else f"the nearest at {found:.6f} s")
+            )
+        return Frame(found[1], found[0] - start)
+
+    def close(self) -> None:
+        """Closes all videos."""
+        with self._lock:
+            for path in list(self._open):
+                self._forget(path)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__init__()  # type: ignore[misc]
+
+    def _forget(self, path: Path) -> None:
+        video = self._open.pop(path, None)
+        if video is not None:
+            video.container.close()
+
+
+class _Video:
+    """An open video, and where its decoder is."""
+
+    def __init__(self, path: Path) -> None:
+        SACCADE.require("av")
+        import av
+
+        self.container = av.open(str(path))
+        streams: Any = self.container.streams.video
+        if not streams:
+            self.container.close()
+            raise ValueError("it has no video stream")
+        self.stream = streams[0]
+        self.stream.thread_type = "AUTO"
+        rate = self.stream.average_rate
+        self.interval = float(1 / rate) if rate else 1.0
+        self.frames: Iterator[av.VideoFrame] = iter(())
+        self.last: tuple[float, UInt8Array] | None = None
+
+    def frame(self, time: float) -> tuple[float, UInt8Array] | float:
+        """Time and pixels of the frame at a time; or the time of the nearest frame, if none is there."""
+        if self.last is not None and _is_at(self.last[0], time):
+            return self.last
+        if self.last is None or not self.last[0] < time < self.last[0] + MOST_AHEAD * self.interval:
+            self.last = None
+            place = max(round(time / self.stream.time_base) - 1, 0)
+            self.container.seek(place, stream=self.stream, backward=True, any_frame=False)
+            self.frames = self.container.decode(self.stream)
+        nearest = float("inf")
+        for frame in self.frames:
+            if frame.pts is None:
+                continue
+            now = float(frame.time)
+            if abs(now - time) < abs(nearest - time):
+                nearest = now
+            if _is_at(now, time):
+                self.last = now, cast("UInt8Array", frame.to_ndarray(format="rgb24"))
+                return self.last
+            if now > time:
+                break
+        self.last = None
+        return nearest
+
+
+def _is_at(frame: float, time: float) -> bool:
+    """Whether a frame is the one at a time. As in lerobot, both are rounded to float32 first."""
+    return bool(abs(np.float32(frame) - np.float32(time)) <= TOLERANCE)
+
+
+def _errors() -> tuple[type[BaseException], ...]:
+    import av
+
+    return av.FFmpegError, OSError, ValueError, EOFError

@@ -1,0 +1,164 @@
+"""Reading data sets: every step and frame of those that pyarrow and PyAV wrote."""
+
+from __future__ import annotations
+
+import pickle
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import saccade.datasets
+from tests.helpers import dataset_cases as cases
+
+#: The modality configs of N1.7 with a history and chunks that reach beyond the end.
+CONFIGS: dict[str, Any] = {
+    "video": {"delta_indices": [-2, 0], "modality_keys": ["wrist", "front"]},
+    "state": {"delta_indices": [-1, 0], "modality_keys": ["hand", "arm"]},
+    "action": {"delta_indices": list(range(16)), "modality_keys": ["arm", "hand", "base"]},
+    "language": {"delta_indices": [0], "modality_keys": ["annotation.human.task_description"]},
+}
+
+
+@pytest.fixture(scope="module", params=["v2.0", "v2.1", "v3.0", "images"])
+def root(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder: Path = tmp_path_factory.mktemp("data")
+    if request.param in ("v2.0", "v2.1"):
+        return cases.write_old(folder, request.param)
+    return cases.write_new(folder, "image" if request.param == "images" else "video")
+
+
+def frames_of(root: Path, episode: int, name: str) -> list[np.ndarray[Any, Any]]:
+    """All frames of an episode, decoded from the start of the video; or those that became PNGs."""
+    camera = ("front", "wrist").index(name)
+    key = f"observation.images.{name}"
+    if not (root / "videos").exists():
+        return list(cases.pixels(episode, cases.LENGTHS[episode], camera))
+    old = root / "videos" / f"chunk-{episode // 2:03d}" / key / f"episode_{episode:06d}.mp4"
+    if old.exists():
+        return [pixels for _, pixels in cases.decoded(old)]
+    first = sum(cases.LENGTHS[:episode])
+    found = cases.decoded(root / "videos" / key / "chunk-000" / "file-000.mp4")
+    return [pixels for _, pixels in found[first : first + cases.LENGTHS[episode]]]
+
+
+def test_what_a_data_set_says_about_itself(root: Path) -> None:
+    data = saccade.datasets.open(root)
+    assert len(data) == 3
+    assert [one.length for one in data.episodes] == list(cases.LENGTHS)
+    assert data.episodes[2].steps == range(23)
+    assert data.episodes[1].tasks == (cases.TASKS[1],)
+    assert data.tasks == cases.TASKS
+    assert data.fps == cases.FPS
+    assert data.robot == "so100"
+    assert data.cameras == ("front", "wrist")
+    assert data.state_widths == {"arm": 3, "hand": 1}
+    assert data.action_widths == {"arm": 3, "hand": 1, "base": 1}
+    assert "3 episodes, 31 steps at 10 Hz, 2 tasks" in repr(data)
+
+
+def test_every_frame_in_any_order_is_that_of_the_whole_video(root: Path) -> None:
+    data = saccade.datasets.open(root)
+    rng = np.random.default_rng(0)
+    for episode in (2, 0, 1):
+        for name in ("front", "wrist"):
+            expected = frames_of(root, episode, name)
+            steps = list(data.episodes[episode].steps)
+            for step in [*steps, *reversed(steps), *rng.permutation(steps)]:
+                found = data.frame(episode, int(step), name)
+                np.testing.assert_array_equal(found.pixels, expected[step])
+                assert found.timestamp == pytest.approx(step / cases.FPS, abs=1e-6)
+
+
+def test_observations_of_a_history(root: Path) -> None:
+    data = saccade.datasets.open(root, data_config=CONFIGS)
+    for episode in (0, 1, 2):
+        recorded = cases.columns(episode, cases.LENGTHS[episode], 0)["observation.state"]
+        frames = {name: frames_of(root, episode, name) for name in ("front", "wrist")}
+        for step in data.episodes[episode].steps:
+            found = data.observation(episode, step)
+            assert list(found["video"]) == ["wrist", "front"]
+            for name, shown in found["video"].items():
+                assert shown.dtype == np.uint8
+                places = [max(step - 2, 0), step]
+                np.testing.assert_array_equal(shown[0], np.stack([frames[name][place] for place in places]))
+            rows = recorded[[max(step - 1, 0), step]]
+            assert list(found["state"]) == ["hand", "arm"]
+            np.testing.assert_array_equal(found["state"]["arm"][0], rows[:, :3])
+            np.testing.assert_array_equal(found["state"]["hand"][0], rows[:, 3:])
+            assert found["language"] == {"annotation.human.task_description": [[cases.TASKS[episode % 2]]]}
+
+
+def test_the_forms_hold_the_same(root: Path) -> None:
+    data = saccade.datasets.open(root, data_config=CONFIGS)
+    nested, flat, lerobot = (data.observation(2, 9, form) for form in ("isaac", "isaac flat", "lerobot"))
+    for name, frames in nested["video"].items():
+        np.testing.assert_array_equal(flat[f"video.{name}"], frames)
+        np.testing.assert_array_equal(lerobot[f"observation.images.{name}"], np.moveaxis(frames, -1, -3))
+    state = np.concatenate(list(nested["state"].values()), axis=-1)
+    np.testing.assert_array_equal(lerobot["observation.state"], state)
+    assert flat["annotation.human.task_description"] == lerobot["task"] == [cases.TASKS[0]]
+    with pytest.raises(saccade.InputError, match="form: expected one of isaac, isaac flat, lerobot, got 'x'"):
+        data.observation(2, 9, "x")
+
+
+def test_actions_at_the_end_of_an_episode(root: Path) -> None:
+    data = saccade.datasets.open(root, data_config=CONFIGS)
+    recorded = cases.columns(2, 23, 0)
+    for step in (0, 7, 8, 22):
+        found = data.actions(2, step)
+        places = np.minimum(step + np.arange(16), 22)
+        np.testing.assert_array_equal(found["arm"], recorded["action"][places, :3])
+        np.testing.assert_array_equal(found["base"], recorded["action.base"][places, 1:])
+        assert found["base"].dtype == np.float64
+        past = step + np.arange(16) > 22
+        np.testing.assert_array_equal(found["hand"][past], 0)  # N1.5, for keys that are not absolute
+        np.testing.assert_array_equal(found["hand"][~past], recorded["action"][places[~past], 3:])
+        few = data.actions(2, step, 5)
+        assert all(np.array_equal(few[key], found[key][:5]) for key in found)
+    assert data.actions(1, 0)["arm"].shape == (16, 3)
+    assert data.actions(2, 0, 23)["arm"].shape == (23, 3)
+    without = saccade.datasets.open(root)
+    np.testing.assert_array_equal(without.actions(2, 20, 3)["arm"], recorded["action"][20:, :3])
+    with pytest.raises(saccade.InputError, match="horizon: expected a number"):
+        without.actions(2, 0)
+
+
+def test_a_data_set_without_modality_has_lerobots_names(tmp_path: Path) -> None:
+    data = saccade.datasets.open(cases.write_old(tmp_path, modality=None))
+    assert (data.cameras, data.state_widths, data.action_widths) == (
+        ("front", "wrist"),
+        {"state": 4},
+        {"action": 4},
+    )
+    found = data.observation(0, 2, "lerobot")
+    assert list(found) == [
+        "observation.images.front",
+        "observation.images.wrist",
+        "observation.state",
+        "task",
+    ]
+    assert found["observation.images.front"].shape == (1, 3, *cases.SIZE)
+    assert found["task"] == [cases.TASKS[0]]
+    assert data.instruction(1, 0) == cases.TASKS[1]
+
+
+def test_a_copy_reads_the_same(root: Path) -> None:
+    data = saccade.datasets.open(root)
+    before = data.frame(0, 3, "front").pixels
+    copied = pickle.loads(pickle.dumps(data))
+    np.testing.assert_array_equal(copied.frame(0, 3, "front").pixels, before)
+    assert copied.fingerprint() == data.fingerprint()
+
+
+def test_the_fingerprint_is_of_every_file(tmp_path: Path) -> None:
+    data = saccade.datasets.open(cases.write_old(tmp_path))
+    seen = {data.fingerprint()}
+    for path in sorted(tmp_path.rglob("*.*")):
+        if path.is_dir():
+            continue
+        path.write_bytes(path.read_bytes() + b"\n")
+        assert data.fingerprint() not in seen
+        seen.add(data.fingerprint())
+    assert len(seen) == 1 + 4 + 3 + 6
