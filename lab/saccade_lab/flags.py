@@ -7,6 +7,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from saccade._internal.arrays import PRECISIONS
+from saccade._internal.extras import SACCADE
 from saccade._internal.flags import (
     Arguments,
     UsageError,
@@ -49,6 +50,30 @@ def add_tasks(parser: Arguments, help: str = "tasks to run (default: all that th
 def add_episodes(parser: Arguments, default: int | None, help: str = "episodes per task") -> None:
     """Declares the number of episodes of each task."""
     add_integer(parser, "--episodes", default=default, help=help)
+
+
+def add_record(parser: Arguments) -> None:
+    """Declares the folder of a data set; see ``check_record``."""
+    parser.add_argument(
+        "--record",
+        type=Path,
+        metavar="DIR",
+        help="write a data set in lerobot's format to this new folder (extra data of saccade)",
+    )
+
+
+def check_record(path: Path | None) -> None:
+    """Checks that a data set can be written to a folder.
+
+    Raises:
+        MissingExtraError: A package of saccade's extra ``data`` is not installed.
+        InputError: There is something in the folder.
+    """
+    if path is None:
+        return
+    SACCADE.require("pyarrow", "av")
+    if path.exists() and (not path.is_dir() or any(path.iterdir())):
+        raise InputError(f"--record: expected a new or empty folder, got {path}, where something is")
 
 
 def add_frames(parser: argparse.ArgumentParser) -> None:

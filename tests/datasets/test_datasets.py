@@ -96,9 +96,10 @@ def test_the_forms_hold_the_same(root: Path) -> None:
     for name, frames in nested["video"].items():
         np.testing.assert_array_equal(flat[f"video.{name}"], frames)
         np.testing.assert_array_equal(lerobot[f"observation.images.{name}"], np.moveaxis(frames, -1, -3))
-    state = np.concatenate(list(nested["state"].values()), axis=-1)
+    # lerobot has the whole column, in its order.
+    state = np.concatenate([nested["state"][key] for key in ("arm", "hand")], axis=-1)
     np.testing.assert_array_equal(lerobot["observation.state"], state)
-    assert flat["annotation.human.task_description"] == lerobot["task"] == [cases.TASKS[0]]
+    assert flat["annotation.human.task_description"] == [lerobot["task"]] == [[cases.TASKS[0]]]
     with pytest.raises(saccade.InputError, match="form: expected one of isaac, isaac flat, lerobot, got 'x'"):
         data.observation(2, 9, "x")
 

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
+import tempfile
+from pathlib import Path
 
 from saccade._internal import flags as arguments
 from saccade.cli import EXIT_OK, output
@@ -19,13 +22,15 @@ EPILOG = """\
 Tasks of the demo: reach, push, drawer-open, button-press-topdown, window-open. Harder tasks, for studies:
 two-goals, stereo-reach, two-stage, fork.
 
-Writes DIR/TASK/SEED.npz. If the command is interrupted, run it again: it continues where it stopped. The
-files are the same with any number of processes and machines.
+--out writes DIR/TASK/SEED.npz for `saccade train`, --record a data set that lerobot and
+saccade.datasets.open read. If the command is interrupted, run it again: with --out it
+continues where it stopped. The files are the same with any number of processes and machines.
 
 examples:
   saccade demos --out out/demos                               the data of the bundled policy
   saccade demos --out out/demos --tasks reach --episodes 50
   saccade demos --out out/study --tasks two-goals,stereo-reach,two-stage --jobs -1
+  saccade demos --record out/recordings --tasks reach --episodes 20
   saccade demos --out out/demos --backend ray --address auto
 """
 
@@ -35,7 +40,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     from saccade_lab.sim.cameras import DEFAULT_IMAGE_SIZE
 
     parser.epilog = EPILOG
-    arguments.add_out(parser, None, "directory of the recording")
+    parser.add_argument(
+        "--out", type=Path, metavar="DIR", help="directory of the recording, for `saccade train`"
+    )
+    lab_flags.add_record(parser)
     lab_flags.add_tasks(parser, "tasks to record (default: the five of the demo)")
     lab_flags.add_episodes(
         parser,
@@ -50,7 +58,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="pixels along each side of an image",
     )
     arguments.add_integer(
-        parser, "--frame-stride", default=3, help="control steps between recorded observations"
+        parser,
+        "--frame-stride",
+        default=None,
+        help="control steps between recorded observations (default: 3; 1 with --record)",
     )
     add_worker_arguments(parser, "demonstrations")
 
@@ -60,24 +71,38 @@ def run(args: argparse.Namespace) -> int:
     from saccade_lab.sim.tasks import DEMO_TASKS
 
     lab_flags.check_tasks(args.tasks or ())
+    if args.out is None and args.record is None:
+        raise arguments.UsageError("expected --out or --record, or both")
+    if args.record is not None and args.frame_stride not in (None, 1):
+        raise arguments.UsageError(f"--frame-stride: expected 1 with --record, got {args.frame_stride}")
     workers = workers_of(args)
     require("demos")
+    lab_flags.check_record(args.record)
     from saccade_lab.sim import graphics
-    from saccade_lab.sim.demos import DEFAULT_COUNTS, RecordingSettings, record_tasks
+    from saccade_lab.sim.demos import DEFAULT_COUNTS, RecordingSettings, export, record_tasks
 
     graphics.check()
-    settings = RecordingSettings(image_size=args.image_size, frame_stride=args.frame_stride)
+    stride = args.frame_stride or (3 if args.record is None else 1)
+    settings = RecordingSettings(image_size=args.image_size, frame_stride=stride)
     tasks = args.tasks or [task.name for task in DEMO_TASKS]
     counts = {task: args.episodes or DEFAULT_COUNTS[task] for task in tasks}
-    writable_directory(args.out)
     done = 0
-    with output.progress_bar("demos", sum(counts.values())) as update:
+    with contextlib.ExitStack() as stack:
+        update = stack.enter_context(output.progress_bar("demos", sum(counts.values())))
+        if args.out is None:
+            folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="saccade-demos-")))
+        else:
+            folder = writable_directory(args.out)
 
         def on_episode(task: str) -> None:
             nonlocal done
             done += 1
             update(done, description=task)
 
-        record_tasks(counts, args.out, settings, on_episode, workers)
-    print(f"{sum(counts.values())} demonstrations in {args.out}")
+        record_tasks(counts, folder, settings, on_episode, workers)
+        if args.record is not None:
+            update(done, description="writing the data set")
+            export(folder, counts, args.record)
+    places = " and ".join(str(path) for path in (args.out, args.record) if path is not None)
+    print(f"{sum(counts.values())} demonstrations in {places}")
     return EXIT_OK

@@ -40,6 +40,9 @@ window-open. Harder tasks, for policies of your own: two-goals, stereo-reach, tw
 The same seed gives the same layout, wording and noise with either engine. Seeds from 1000000 on are reserved
 for training and refused.
 
+--record writes a data set that lerobot and saccade.datasets.open read: every control step of every episode,
+with what the policy saw, its actions, and the seeds of its noise. It is written when all episodes are done.
+
 DIR receives results.json (after every episode), contact-sheet.png (of the first 50 seeds) and, with --video,
 videos/TASK-SEED.mp4.
 After Ctrl-C the episodes that are done are kept. With several processes the episodes are the same; an episode
@@ -50,6 +53,7 @@ examples:
   saccade rollout --tasks reach,push --episodes 20 --out out/twenty
   saccade rollout --checkpoint out/policy --engine torch --num-threads 1 --json
   saccade rollout --checkpoint out/policy --data-config my_data_config.json
+  saccade rollout --tasks reach --episodes 10 --record out/reach
   saccade rollout --tasks reach --instruction-from push     the wrong instruction: it should fail
   saccade rollout --episodes 100 --jobs -1                  a process for each core
   saccade rollout --episodes 1000 --backend ray --address auto
@@ -77,6 +81,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_worker_arguments(parser, "episodes")
     arguments.add_out(parser, "out/rollout")
     parser.add_argument("--video", action="store_true", help="write an MP4 of every episode")
+    lab_flags.add_record(parser)
     parser.add_argument(
         "--instruction-from", metavar="TASK", help="give the policy the instruction of this task instead"
     )
@@ -92,6 +97,7 @@ class Session:
     seeds: range
     workers: Workers
     out: Path
+    record_to: Path | None = None
     done: list[Rolled] = field(default_factory=list)
     lost: list[str] = field(default_factory=list)
 
@@ -132,7 +138,7 @@ class Session:
                 with write_atomically(self.out / rolled.episode.video) as temporary:
                     temporary.write_bytes(rolled.video)
             picture = rolled.picture if seed in self.seeds[:COLUMNS] else None
-            self.done.append(Rolled(rolled.episode, picture))
+            self.done.append(Rolled(rolled.episode, picture, recording=rolled.recording))
             self.done.sort(key=lambda one: order[one.episode.task, one.episode.seed])
             write_json(self.out / "results.json", self.record())
             on_episode(rolled)
@@ -148,6 +154,7 @@ def run(args: argparse.Namespace) -> int:
         lab_flags.check_known("--instruction-from", [args.instruction_from], lab_flags.known_tasks())
     workers = workers_of(args, args.num_threads)
     require("rollout")
+    lab_flags.check_record(args.record)
     session = prepare(args, seeds, workers)
     from saccade_lab.sim import environment_cache
     from saccade_lab.sim.report import write_contact_sheet
@@ -166,6 +173,8 @@ def run(args: argparse.Namespace) -> int:
     pictures = [(rolled.episode, rolled.picture) for rolled in session.done if rolled.picture is not None]
     if pictures:
         write_contact_sheet(pictures, session.out / "contact-sheet.png")
+    if session.record_to is not None and session.done and not interrupted:
+        write_recordings_of(session)
     if args.json:
         output.print_json(session.record(), indent=2)
     else:
@@ -196,10 +205,29 @@ def prepare(args: argparse.Namespace, seeds: range, workers: Workers) -> Session
         args.data_config,
         args.action_horizon,
         None if args.processor_options is None else json.dumps(args.processor_options),
+        args.record is not None,
     )
     tasks = list(args.tasks or episodes.policy.config.tasks)
     check_trained_on(episodes.policy, tasks)
-    return Session(episodes, tasks, seeds, workers, args.out)
+    return Session(episodes, tasks, seeds, workers, args.out, args.record)
+
+
+def write_recordings_of(session: Session) -> None:
+    """Writes the data set."""
+    from saccade_lab.sim.environment import SIMULATION_HZ
+    from saccade_lab.sim.recordings import Recording, write_recordings
+
+    assert session.record_to is not None
+    config = session.policy.config
+    contents = [rolled.recording for rolled in session.done]
+    write_recordings(
+        session.record_to,
+        (Recording.from_bytes(content) for content in contents if content is not None),
+        [camera.name for camera in config.cameras],
+        config.image_size,
+        SIMULATION_HZ,
+        noise=True,
+    )
 
 
 def roll_out(session: Session) -> None:
@@ -235,6 +263,8 @@ def show(session: Session) -> None:
     print(f"contact sheet  {session.out / 'contact-sheet.png'}")
     if session.episodes.video:
         print(f"videos         {session.out / 'videos'}")
+    if session.record_to is not None and session.record_to.is_dir():
+        print(f"recordings     {session.record_to}")
 
 
 def make_table(title: str) -> Table:

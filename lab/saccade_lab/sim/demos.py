@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import functools
 import io
+import itertools
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -25,7 +26,7 @@ from saccade_lab.parallel import ALONE, Lost, Workers, each
 from saccade_lab.sim import environment_cache
 from saccade_lab.sim.cameras import DEFAULT_CAMERAS, DEFAULT_IMAGE_SIZE, CameraPose
 from saccade_lab.sim.experts import Expert, NoiseBursts
-from saccade_lab.sim.tasks import DEMO_TASKS, DEMONSTRATION_SEEDS, STUDY_TASKS, TASKS
+from saccade_lab.sim.tasks import DEMO_TASKS, DEMONSTRATION_SEEDS, STUDY_TASKS, TASKS, find_task
 
 if TYPE_CHECKING:
     from saccade_lab.sim.environment import TaskEnvironment
@@ -315,6 +316,31 @@ def read_settings(directory: Path, tasks: Sequence[str]) -> RecordingSettings:
     if any(settings != found[0] for settings in found):
         raise InputError(f"{directory}: the tasks were recorded with different settings")
     return RecordingSettings.from_dict(found[0])
+
+
+def export(directory: Path, counts: Mapping[str, int], path: Path) -> None:
+    """Writes the first episodes of a recording as a data set of lerobot's format.
+
+    A step is a control step, and its action the expert's, also where another one was executed.
+
+    Args:
+        directory: The recording, with an observation for every control step.
+        counts: Number of episodes by task.
+        path: As of ``write_recordings``, which says what is raised.
+    """
+    from saccade_lab.sim.environment import SIMULATION_HZ  # not at the top: reading needs no simulator
+    from saccade_lab.sim.recordings import Recording, write_recordings
+
+    settings = read_settings(directory, list(counts))
+
+    def recordings() -> Iterator[Recording]:
+        for task, count in counts.items():
+            for seed, one in itertools.islice(episodes(directory, task), count):
+                instruction = find_task(task).instruction(seed)
+                yield Recording(instruction, one.images, one.proprio, one.actions)
+
+    cameras = [camera.name for camera in settings.cameras]
+    write_recordings(path, recordings(), cameras, settings.image_size, SIMULATION_HZ, noise=False)
 
 
 def episodes(directory: Path, task: str, *, images: bool = True) -> Iterator[tuple[int, Demonstration]]:

@@ -14,6 +14,7 @@ from saccade_lab.sim import rollout
 from saccade_lab.sim.environment import TaskEnvironment
 from saccade_lab.sim.environment_cache import cached_environment
 from saccade_lab.sim.policy import Policy
+from saccade_lab.sim.recordings import Recorder
 from saccade_lab.sim.report import tile
 from saccade_lab.sim.rollout import Episode, environment_for
 from saccade_lab.sim.video import VideoWriter
@@ -27,11 +28,13 @@ class Rolled:
         episode: The outcome.
         picture: The last picture of the simulation, as a contact sheet shows it.
         video: Bytes of the MP4, if one was wanted.
+        recording: The episode as ``Recording.to_bytes`` gives it, if it was wanted.
     """
 
     episode: Episode
     picture: UInt8Array | None
     video: bytes | None = None
+    recording: bytes | None = None
 
 
 @dataclass(frozen=True)
@@ -46,6 +49,7 @@ class Episodes:
         video: Whether a video is made of each episode.
         data_config, action_horizon: As ``saccade.Policy.from_pretrained`` takes them.
         processor_options: The same, as JSON.
+        record: Whether each episode is recorded.
     """
 
     checkpoint: str
@@ -56,6 +60,7 @@ class Episodes:
     data_config: str | None = None
     action_horizon: int | None = None
     processor_options: str | None = None
+    record: bool = False
 
     @property
     def overrides(self) -> dict[str, Any]:
@@ -80,12 +85,13 @@ class Episodes:
         environment = cached_environment(
             (self.checkpoint, task), lambda: environment_for(policy, task, render_mode="rgb_array")
         )
-        episode, video = (
-            self._filmed(environment, seed) if self.video else (self._run(environment, seed), None)
-        )
+        recorder = Recorder(rollout.rng_seed(task, seed)) if self.record else None
+        run = self._filmed if self.video else self._unseen
+        episode, video = run(environment, seed, on_action=recorder)
         picture = environment.render()
         assert picture is not None
-        return Rolled(episode, tile(picture), video)
+        recording = None if recorder is None else recorder.recording().to_bytes()
+        return Rolled(episode, tile(picture), video, recording)
 
     def _run(self, environment: TaskEnvironment, seed: int, **options: Any) -> Episode:
         """The episode; options as ``run_episode``."""
@@ -93,12 +99,16 @@ class Episodes:
             environment, self.policy, seed, instruction_from=self.instruction_from, **options
         )
 
-    def _filmed(self, environment: TaskEnvironment, seed: int) -> tuple[Episode, bytes]:
+    def _unseen(self, environment: TaskEnvironment, seed: int, **options: Any) -> tuple[Episode, None]:
+        """The episode without a video."""
+        return self._run(environment, seed, **options), None
+
+    def _filmed(self, environment: TaskEnvironment, seed: int, **options: Any) -> tuple[Episode, bytes]:
         """The episode and its video."""
         with tempfile.TemporaryDirectory(prefix="saccade-video-") as folder:
             path = Path(folder) / "episode.mp4"
             with VideoWriter(path) as video:
-                episode = self._run(environment, seed, on_step=video.add)
+                episode = self._run(environment, seed, on_step=video.add, **options)
             episode.video = f"videos/{environment.task.name}-{seed}.mp4"
             return episode, path.read_bytes()
 

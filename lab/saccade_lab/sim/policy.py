@@ -82,12 +82,18 @@ class Chunk:
     """A chunk of actions and the time that it took.
 
     Attributes:
-        actions: ``(horizon, action_dim)`` float32 in [-1, 1].
+        answer: ``(horizon, action_dim)`` float32, as the policy gave them.
         milliseconds: Time of each part: backbone (with preprocessing), encode, sample.
     """
 
-    actions: Float32Array
+    answer: Float32Array
     milliseconds: dict[str, float]
+
+    @property
+    def actions(self) -> Float32Array:
+        """``(horizon, action_dim)`` float32, clipped to [-1, 1]."""
+        clipped: Float32Array = np.clip(self.answer, -1.0, 1.0)
+        return clipped
 
 
 class Policy:
@@ -260,7 +266,7 @@ class Policy:
             for part, before, after in zip(("backbone", "encode", "sample"), times, times[1:], strict=False)
         }
         actions = np.concatenate([answer[name][0] for name in GROUPS], axis=-1)
-        return Chunk(np.clip(actions, -1.0, 1.0), spent)
+        return Chunk(actions, spent)
 
     def blank(self, instruction: str) -> dict[str, Any]:
         """What a black room would show, with the hand in the middle of its range."""

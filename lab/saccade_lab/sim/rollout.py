@@ -1,11 +1,13 @@
 """Closed loop: observe, compute a chunk, execute its first actions, observe again."""
 
 import time
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
+from saccade._internal.arrays import Float32Array
 from saccade_lab.sim.environment import TaskEnvironment
 from saccade_lab.sim.policy import Interventions, Policy
 from saccade_lab.sim.tasks import TASKS, find_task
@@ -43,6 +45,11 @@ def instruction_for(task: str, seed: int, instruction_from: str | None) -> str:
     return find_task(instruction_from or task).instruction(seed)
 
 
+def rng_seed(task: str, seed: int) -> tuple[int, int]:
+    """What the generator of an episode's noise is made from."""
+    return list(TASKS).index(task), seed
+
+
 def run_episode(
     environment: TaskEnvironment,
     policy: Policy,
@@ -51,6 +58,7 @@ def run_episode(
     instruction_from: str | None = None,
     intervention: Interventions | Callable[[int, int], Interventions] = None,
     on_step: Callable[[TaskEnvironment, Episode], None] = lambda environment, episode: None,
+    on_action: Callable[[Mapping[str, Any], Float32Array, int, int], None] | None = None,
 ) -> Episode:
     """Runs one episode to its first success or to the task's ``max_steps``.
 
@@ -62,11 +70,13 @@ def run_episode(
         intervention: A change inside the head at every chunk; or a function that returns it, called with the
             index of the chunk and the seed.
         on_step: Called after the first observation and after every control step, for videos.
+        on_action: Called before every control step with what is seen, the action as the policy gave it, the
+            index of its chunk and its place there, for recordings. What is seen is then drawn at every step.
     """
     task = environment.task
     environment.restart(seed)
     environment.instruction = instruction_for(task.name, seed, instruction_from)
-    rng = np.random.default_rng((list(TASKS).index(task.name), seed))
+    rng = np.random.default_rng(rng_seed(task.name, seed))
     episode = Episode(task.name, seed, environment.instruction)
     total = dict.fromkeys(PARTS, 0.0)
     while episode.steps < task.max_steps and not episode.success:
@@ -80,7 +90,11 @@ def run_episode(
         episode.chunks += 1
         if episode.steps == 0:
             on_step(environment, episode)
-        for action in chunk.actions[: min(policy.config.execute_steps, task.max_steps - episode.steps)]:
+        count = min(policy.config.execute_steps, task.max_steps - episode.steps)
+        for place, action in enumerate(chunk.actions[:count]):
+            if on_action is not None:
+                seen = environment.observe() if place else observation
+                on_action(seen, chunk.answer[place], episode.chunks - 1, place)
             episode.success = environment.advance(action).success
             episode.steps += 1
             on_step(environment, episode)

@@ -18,9 +18,9 @@ from saccade._internal.extras import SACCADE
 from saccade._internal.files import sha256_of
 from saccade.datasets import forms
 from saccade.datasets.features import Episode, Metadata
-from saccade.datasets.modality import ANNOTATION, Columns, Modality
+from saccade.datasets.modality import ANNOTATION, Columns, Modality, plain
 from saccade.datasets.parquet import Steps, read_steps
-from saccade.datasets.selection import Selection
+from saccade.datasets.selection import Part, Selection
 from saccade.datasets.videos import TOLERANCE, Frame, Videos
 from saccade.errors import DatasetError, InputError
 
@@ -113,18 +113,20 @@ class Dataset:
 
         Args:
             episode, step: Which step.
-            form: ``"isaac"`` (nested), ``"isaac flat"`` or ``"lerobot"``.
+            form: ``"isaac"`` (nested), ``"isaac flat"`` or ``"lerobot"``. That of lerobot has every camera,
+                the whole state and the task, by the names that the data set gives them, whatever
+                ``modality.json`` says; a data config only gives it its history.
 
         Raises:
             InputError: There is no such step or form, or the data set does not say which instruction counts.
             DatasetError: What was recorded is damaged; the message names file, episode and step.
         """
-        writer = forms.FORMS.get(form)
-        if writer is None:
+        if form not in forms.FORMS:
             raise InputError(f"form: expected one of {', '.join(forms.FORMS)}, got {form!r}")
         self._place(episode, step)
-        frames = {camera: self._history(episode, step, camera) for camera in self.cameras}
-        return writer(frames, self.state(episode, step), self.language_key, self.instruction(episode, step))
+        if form == "lerobot":
+            return self._as_lerobot()._observation(episode, step, form)
+        return self._observation(episode, step, form)
 
     def state(self, episode: int, step: int) -> dict[str, Float32Array]:
         """The state at a step, ``{key: (history, width)}`` float32 in the robot's units.
@@ -224,6 +226,47 @@ class Dataset:
         _check_shape(where, found.pixels, feature.shape)
         return found
 
+    def column(self, episode: int, name: str) -> npt.NDArray[Any]:
+        """A column of numbers as it was recorded, ``(steps, width)``, of the type that it has.
+
+        Raises:
+            InputError: There is no such episode or column.
+            DatasetError: What was recorded is damaged.
+        """
+        self._place(episode, 0)
+        feature = self._metadata.features.get(name)
+        if feature is None or feature.is_camera:
+            known = ", ".join(key for key, one in self._metadata.features.items() if not one.is_camera)
+            raise InputError(f"name: expected a column, one of {known}, got {name!r}")
+        return self._column(episode, name)
+
+    def noise(self, episode: int, step: int, shape: tuple[int, ...]) -> Float32Array | None:
+        """The noise that a policy computed the chunk of a step from, if `saccade rollout` recorded it.
+
+        The column ``noise_seed`` has three integers ``(a, b, k)``: the noise is the draw ``k``, from 0, of
+        ``numpy.random.default_rng((a, b))``, standard normal in float32.
+
+        Args:
+            episode, step: Which step.
+            shape: The shape of the noise, ``(1, horizon, width)`` as :meth:`saccade.Policy.act` takes it.
+
+        Returns:
+            None if the data set has no such column, or no chunk begins at this step.
+
+        Raises:
+            InputError, DatasetError: As :meth:`observation`.
+        """
+        place = self._place(episode, step)
+        if not {"noise_seed", "chunk_step"} <= set(self._metadata.features):
+            return None
+        if self._column(episode, "chunk_step")[place, 0]:
+            return None
+        *seed, draw = self._column(episode, "noise_seed")[place].tolist()
+        rng = np.random.default_rng(seed)
+        for _ in range(draw):
+            rng.standard_normal(shape, dtype=np.float32)
+        return rng.standard_normal(shape, dtype=np.float32)
+
     @property
     def statistics(self) -> dict[str, dict[str, dict[str, npt.NDArray[np.float64]]]]:
         """Recorded statistics by modality, key and name: ``statistics["action"]["arm"]["mean"]``.
@@ -258,6 +301,27 @@ class Dataset:
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__init__(**state)  # type: ignore[misc]
+
+    def _observation(self, episode: int, step: int, form: str) -> dict[str, Any]:
+        frames = {camera: self._history(episode, step, camera) for camera in self.cameras}
+        text = self.instruction(episode, step)
+        return forms.FORMS[form](frames, self.state(episode, step), self.language_key, text)
+
+    def _as_lerobot(self) -> Dataset:
+        """The data set with lerobot's names, and the history of this one."""
+        keys = plain(self._metadata.features, self._modality.where)
+        seen = self._selection
+        video, state = (
+            Part(tuple(keys.video), seen.video.indices),
+            Part(tuple(keys.state), seen.state.indices),
+        )
+        return self._with(keys, Selection(video, state, Part(tuple(keys.action), seen.action.indices), None))
+
+    def _with(self, modality: Modality, selection: Selection) -> Dataset:
+        """The data set with other keys, which shares what is open and read."""
+        found = Dataset(self._metadata, modality, selection)
+        found._videos, found._cache, found._lock = self._videos, self._cache, self._lock
+        return found
 
     def _place(self, episode: int, step: int) -> int:
         """The step, after checking that both are there."""

@@ -24,16 +24,19 @@ def isaac(frames: Frames, state: States, key: str, text: str) -> dict[str, Any]:
 
 
 def isaac_flat(frames: Frames, state: States, key: str, text: str) -> dict[str, Any]:
-    """Isaac-GR00T's flat form: ``video.<name>``, ``state.<name>`` and the key of the instruction."""
+    """Isaac-GR00T's flat form: ``video.<name>``, ``state.<name>`` and the key of the instruction.
+
+    The instruction is in a list, as the released loader of N1.5 has it.
+    """
     return {
         **{f"video.{name}": value[None] for name, value in frames.items()},
         **{f"state.{name}": value[None] for name, value in state.items()},
-        key: [text],
+        key: [[text]],
     }
 
 
 def lerobot(frames: Frames, state: States, key: str, text: str) -> dict[str, Any]:
-    """Lerobot's form: ``observation.images.<name>``, ``observation.state`` and ``task``.
+    """The form of lerobot: ``observation.images.<name>``, ``observation.state`` and ``task``.
 
     A single frame and a single state have no axis for the history.
     """

@@ -15,6 +15,73 @@ import numpy.typing as npt
 
 Numbers = npt.NDArray[np.floating[Any]]
 
+QUANTILES = (0.01, 0.10, 0.50, 0.90, 0.99)
+BINS = 5000
+#: Of larger frames every n-th row and column counts, so that the longer side has about this many.
+LARGE, REDUCED = 300, 150
+
+
+def of_column(values: npt.NDArray[Any]) -> dict[str, npt.NDArray[Any]]:
+    """The statistics of a column of an episode, ``(steps, width)``, each of shape ``(width,)``."""
+    return _of_rows(values) | {"count": np.array([len(values)])}
+
+
+def of_frames(frames: npt.NDArray[np.uint8]) -> dict[str, npt.NDArray[Any]]:
+    """The statistics of frames of an episode, ``(steps, H, W, 3)``, from 0 to 1, each of shape ``(3, 1, 1)``.
+
+    Of long episodes some frames count, evenly spaced.
+    """
+    count = max(min(100, len(frames)), min(int(len(frames) ** 0.75), 10_000))
+    sampled = frames[np.round(np.linspace(0, len(frames) - 1, count)).astype(int)]
+    height, width = frames.shape[1:3]
+    if max(height, width) >= LARGE:
+        every = int(width / REDUCED) if width > height else int(height / REDUCED)
+        sampled = sampled[:, ::every, ::every]
+    found = _of_rows(sampled.reshape(-1, 3))
+    return {name: value.reshape(3, 1, 1) / 255.0 for name, value in found.items()} | {
+        "count": np.array([count])
+    }
+
+
+def _of_rows(rows: npt.NDArray[Any]) -> dict[str, npt.NDArray[Any]]:
+    """All statistics but the count. A single row is each of its quantiles."""
+    if len(rows) < 2:
+        mean = np.mean(rows, axis=0)
+        found = {"min": rows[0], "max": rows[0], "mean": mean, "std": np.std(rows, axis=0)}
+        return found | {_name(quantile): mean for quantile in QUANTILES}
+    rows = rows.astype(np.result_type(rows.dtype, np.float32))
+    mean, low, high = rows.mean(axis=0), rows.min(axis=0), rows.max(axis=0)
+    found = {
+        "min": low,
+        "max": high,
+        "mean": mean,
+        "std": np.sqrt(np.maximum(0, np.mean(rows**2, axis=0) - mean**2)),
+    }
+    binned = []
+    for place in range(rows.shape[1]):
+        edges = np.linspace(low[place] - 1e-10, high[place] + 1e-10, BINS + 1)
+        binned.append((np.cumsum(np.histogram(rows[:, place], bins=edges)[0]), edges))
+    for quantile in QUANTILES:
+        wanted = quantile * len(rows)
+        found[_name(quantile)] = np.array([_quantile(sums, edges, wanted) for sums, edges in binned])
+    return found
+
+
+def _name(quantile: float) -> str:
+    return f"q{int(quantile * 100):02d}"
+
+
+def _quantile(sums: npt.NDArray[Any], edges: npt.NDArray[Any], wanted: float) -> Any:
+    """The value below which ``wanted`` rows are, interpolated in its bin."""
+    place = int(np.searchsorted(sums, wanted))
+    if place == 0:
+        return edges[0]
+    if place >= len(sums):
+        return edges[-1]
+    inside = sums[place] - sums[place - 1]
+    share = (wanted - sums[place - 1]) / inside
+    return edges[place] + share * (edges[place + 1] - edges[place])
+
 
 def aggregate(episodes: Sequence[Mapping[str, Mapping[str, Numbers]]]) -> dict[str, dict[str, Numbers]]:
     """The statistics of several episodes together.
