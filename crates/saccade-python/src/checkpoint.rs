@@ -6,7 +6,8 @@ use std::path::PathBuf;
 use numpy::PyArrayDyn;
 use pyo3::prelude::*;
 use pyo3::types::{PyBytes, PyDict};
-use saccade_vla::{Checkpoint, TensorFacts};
+use saccade_vla::TensorFacts;
+use saccade_vla::files::Checkpoint;
 
 use crate::arrays::to_numpy;
 use crate::config::config_dict;

@@ -86,7 +86,7 @@ pub use rewrite::{
     ConvertOptions, ConvertReport, Float, MergedTokens, QuantizeReport, ResizeOptions, ResizeReport,
     RewriteOptions, Written, convert, merge_future_tokens, open_base, quantize, resize, resized_config,
 };
-pub use saccade_vla_checkpoint::{self as files, Checkpoint, Elements};
+pub use saccade_vla_checkpoint as files;
 #[cfg(feature = "peak")]
 pub use saccade_vla_kernels::peak;
 pub use saccade_vla_kernels::{

@@ -11,7 +11,7 @@ use crate::nn::attention::{Attention, AttentionWorkspace, Bias, CrossKeys};
 use crate::nn::sequences::Sequences;
 use crate::nn::source::memory::{self, MemorySource, TensorViews};
 use crate::nn::source::planner::plan;
-use crate::nn::weights::{Builder, Weights};
+use crate::nn::weights::{self, Weights};
 use crate::precision::Precision;
 use crate::profile::Part;
 use crate::workspaces::Workspaces;
@@ -109,7 +109,7 @@ impl CrossAttention {
             )));
         }
         let source = MemorySource::new(tensors);
-        let (attention, nbytes) = Builder::build(&source, engine, layer(num_heads))?;
+        let (attention, nbytes) = weights::build(&source, engine, layer(num_heads))?;
         Ok(Self {
             attention,
             nbytes,
@@ -204,10 +204,7 @@ impl CrossAttention {
         let keys = CrossKeys {
             caches: &kv.packed,
             subset: None,
-            bias: Bias {
-                keys: logit_bias.as_deref(),
-                shared: None,
-            },
+            bias: logit_bias.as_deref().map_or(Bias::None, Bias::Keys),
             probabilities,
         };
         let y = Sequences::new(Rows::new(hidden_states.data(), self.width()), batch);

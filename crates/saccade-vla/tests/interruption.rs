@@ -1,17 +1,19 @@
 //! Calls that compute little or nothing stop too when they are asked to, and leave nothing behind.
 
-use std::path::{Path, PathBuf};
+mod common;
+
+use std::path::PathBuf;
 use std::time::Duration;
 
 use saccade_vla::{
     ActionHead, ConvertOptions, Error, HeadConfig, LoadOptions, ResizeOptions, Result, RewriteOptions,
-    convert, files::Checkpoint, interruptible, merge_future_tokens, quantize, resize, tensor_shapes,
+    convert, interruptible, merge_future_tokens, quantize, resize, tensor_shapes,
 };
 
 /// A released head and its config, which is in the file's metadata.
 fn source() -> (PathBuf, String) {
-    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../tests/data/n15_tiny.safetensors");
-    let config = Checkpoint::open(&path).unwrap().metadata()["config"].clone();
+    let path = common::data("n15_tiny.safetensors");
+    let config = common::metadata(&path, "config");
     (path, config)
 }
 

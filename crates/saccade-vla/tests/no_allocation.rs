@@ -1,10 +1,12 @@
 //! Sampling allocates nothing after the first call of a shape.
 
+mod common;
+
 use std::alloc::{GlobalAlloc, Layout, System};
-use std::path::Path;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
-use saccade_vla::{ActionHead, Array, ArrayMut, Chunking, Features, LoadOptions, Sampling};
+use common::{Inputs, released};
+use saccade_vla::{Array, ArrayMut, Chunking, Sampling};
 
 struct Counting;
 
@@ -27,23 +29,6 @@ unsafe impl GlobalAlloc for Counting {
 #[global_allocator]
 static ALLOCATOR: Counting = Counting;
 
-/// A released head; its config stands in the file's metadata.
-fn released(name: &str, threads: usize) -> ActionHead {
-    let path = Path::new(env!("CARGO_MANIFEST_DIR"))
-        .join("../../tests/data")
-        .join(name);
-    let bytes = std::fs::read(&path).unwrap();
-    let size = usize::try_from(u64::from_le_bytes(bytes[..8].try_into().unwrap())).unwrap();
-    let header: serde_json::Value = serde_json::from_slice(&bytes[8..8 + size]).unwrap();
-    let config = header["__metadata__"]["config"].as_str().unwrap().to_owned();
-    let options = LoadOptions {
-        config: Some(config),
-        num_threads: Some(threads),
-        ..LoadOptions::default()
-    };
-    ActionHead::load(&path, &options).unwrap()
-}
-
 #[test]
 fn the_second_sample_of_a_shape_allocates_nothing() {
     // The three kinds of head, and threads: none is like another to the code that runs.
@@ -56,14 +41,7 @@ fn the_second_sample_of_a_shape_allocates_nothing() {
         let head = released(name, threads);
         let config = head.config();
         let (horizon, width) = (config.action_horizon, config.encoder_action_dim);
-        let features = vec![0.1; 2 * 50 * config.context_dim];
-        let image_mask: Vec<_> = (0..2 * 50).map(|token| token % 3 == 1).collect();
-        let features_shape = [2, 50, config.context_dim];
-        let features = Features {
-            image_mask: Some(Array::new(&image_mask, &[2, 50]).unwrap()),
-            ..Features::new(Array::new(&features, &features_shape).unwrap())
-        };
-        let context = head.encode(&features).unwrap();
+        let context = Inputs::new(&head, &[1, 3], 50).context;
         let (state, noise) = (
             vec![0.2; 2 * config.state_dim],
             vec![0.3; 2 * 3 * horizon * width],

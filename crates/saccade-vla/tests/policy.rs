@@ -1,6 +1,8 @@
 //! A policy has the bits of its parts, called one after the other.
 
-use std::path::{Path, PathBuf};
+mod common;
+
+use std::path::Path;
 use std::time::Duration;
 
 use saccade_vla::{
@@ -10,10 +12,6 @@ use saccade_vla::{
 
 const SIDE: usize = 68;
 const SHAPE: [usize; 3] = [SIDE, SIDE, 3];
-
-fn demo_path() -> PathBuf {
-    Path::new(env!("CARGO_MANIFEST_DIR")).join("../../python/saccade/checkpoints/demo")
-}
 
 fn demo() -> Policy {
     let num_threads = Some(1);
@@ -30,7 +28,7 @@ fn demo() -> Policy {
         head,
         ..PolicyLoadOptions::default()
     };
-    Policy::load(&demo_path(), &options).unwrap()
+    Policy::load(&common::demo(), &options).unwrap()
 }
 
 fn picture(seed: usize) -> Vec<u8> {

@@ -42,7 +42,10 @@ impl<'a> FeatureBatch<'a> {
             .map(|features| features.num_tokens())
             .max()
             .unwrap_or(0);
-        let mask = |name, value| OwnedArray::new(filled(name, count * longest, value)?, &[count, longest]);
+        let mask = |name, value| {
+            let shape = [count, longest];
+            OwnedArray::new(filled(name, product(name, &shape)?, value)?, &shape)
+        };
         let is_ragged = all.iter().any(|features| features.num_tokens() < longest);
         let mut attention_mask = mask("attention_mask", true)?;
         let mut image_mask = mask("image_mask", false)?;

@@ -8,14 +8,15 @@ use super::checkpoint::BackboneCheckpoint;
 use super::json::GivenConfig;
 use super::model::Backbone;
 use super::recognise::Recognised;
-use crate::engine::Engine;
+use crate::engine::{Engine, next_id};
 use crate::error::Result;
 use crate::nn::source::Source;
 use crate::nn::source::file::FileSource;
 use crate::nn::source::memory::{self, MemorySource, TensorViews};
 use crate::nn::source::planner::plan;
-use crate::nn::weights::Builder;
+use crate::nn::weights;
 use crate::precision::Precision;
+use crate::workspaces::Workspaces;
 
 /// Options of loading a backbone.
 #[derive(Clone, Debug, Default)]
@@ -87,7 +88,14 @@ impl Backbone {
     }
 
     fn build(source: &dyn Source, engine: Engine, found: &Recognised) -> Result<Self> {
-        let (layers, nbytes) = Builder::build(source, engine, |weights| found.layers(weights))?;
-        Ok(Self::new(found.config.clone(), engine, layers, nbytes))
+        let (layers, nbytes) = weights::build(source, engine, |weights| found.layers(weights))?;
+        Ok(Self {
+            config: found.config.clone(),
+            engine,
+            id: next_id(),
+            layers,
+            nbytes,
+            workspaces: Workspaces::new(),
+        })
     }
 }

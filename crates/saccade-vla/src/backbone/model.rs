@@ -7,7 +7,7 @@ use super::layers::BackboneLayers;
 use super::qwen3::LanguageWorkspace;
 use super::vision::VisionWorkspace;
 use crate::alloc::Scratch;
-use crate::engine::{Engine, next_id};
+use crate::engine::Engine;
 use crate::error::Result;
 use crate::workspaces::Workspaces;
 
@@ -18,8 +18,8 @@ pub struct Backbone {
     /// Tells features of this backbone from those of others.
     pub(super) id: u64,
     pub(super) layers: BackboneLayers,
-    nbytes: usize,
-    workspaces: Workspaces<BackboneWorkspace>,
+    pub(super) nbytes: usize,
+    pub(super) workspaces: Workspaces<BackboneWorkspace>,
 }
 
 /// Memory kept between calls.
@@ -33,18 +33,6 @@ pub(super) struct BackboneWorkspace {
 }
 
 impl Backbone {
-    /// A backbone of `layers`, which hold `nbytes` of weights.
-    pub(super) fn new(config: BackboneConfig, engine: Engine, layers: BackboneLayers, nbytes: usize) -> Self {
-        Self {
-            config,
-            engine,
-            id: next_id(),
-            layers,
-            nbytes,
-            workspaces: Workspaces::new(),
-        }
-    }
-
     /// Sizes and switches.
     #[must_use]
     pub fn config(&self) -> &BackboneConfig {

@@ -5,7 +5,7 @@ use super::state_dropout::StateDropout;
 use super::workspace::Workspace;
 use crate::array::Array;
 use crate::config::{HeadConfig, Reads};
-use crate::engine::{Engine, next_id};
+use crate::engine::Engine;
 use crate::error::Result;
 use crate::workspaces::Workspaces;
 
@@ -22,32 +22,11 @@ pub struct ActionHead {
     pub(super) embodiment_ids: Vec<usize>,
     pub(super) layers: HeadLayers,
     pub(super) state_dropout: StateDropout,
-    nbytes: usize,
-    workspaces: Workspaces<Workspace>,
+    pub(super) nbytes: usize,
+    pub(super) workspaces: Workspaces<Workspace>,
 }
 
 impl ActionHead {
-    /// A head of `layers`, which hold `nbytes` of weights.
-    pub(super) fn new(
-        config: HeadConfig,
-        engine: Engine,
-        embodiment_ids: Vec<usize>,
-        layers: HeadLayers,
-        state_dropout: StateDropout,
-        nbytes: usize,
-    ) -> Self {
-        Self {
-            config,
-            engine,
-            id: next_id(),
-            embodiment_ids,
-            layers,
-            state_dropout,
-            nbytes,
-            workspaces: Workspaces::new(),
-        }
-    }
-
     /// Sizes and switches.
     #[must_use]
     pub fn config(&self) -> &HeadConfig {

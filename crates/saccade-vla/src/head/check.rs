@@ -6,7 +6,7 @@ use super::sample::Sampling;
 use crate::alloc::reserve;
 use crate::array::{Array, ArrayMut};
 use crate::error::{Error, Problem, Result, problem, show_shape};
-use crate::inspect::extent::Extent;
+use crate::inspect::call_sizes::CallSizes;
 use crate::inspect::intervention::Intervention;
 use crate::sampling::chunking::Seam;
 
@@ -139,15 +139,15 @@ impl ActionHead {
     }
 
     /// The sizes of a call on `context`.
-    pub(super) fn extent<'a>(
+    pub(super) fn call_sizes<'a>(
         &'a self,
         interventions: &'a [Intervention],
         context: &Context,
         num_steps: usize,
-    ) -> Result<Extent<'a>> {
+    ) -> Result<CallSizes<'a>> {
         let learned = self.layers.future_tokens.data();
         let tokens = [context.batch, context.num_vl_tokens];
-        Extent::new(&self.config, learned, interventions, tokens, num_steps)
+        CallSizes::new(&self.config, learned, interventions, tokens, num_steps)
     }
 
     pub(super) fn check_timestep(&self, timestep: Array<'_, i64>, batch: usize) -> Result<Vec<usize>> {

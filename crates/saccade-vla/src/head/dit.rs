@@ -13,7 +13,7 @@ use crate::alloc::Scratch;
 use crate::config::{HeadConfig, Reads};
 use crate::engine::{Engine, Kernels};
 use crate::error::{Error, Result};
-use crate::inspect::changes::Changes;
+use crate::inspect::compiled::CompiledInterventions;
 use crate::inspect::groups::{Group, Groups};
 use crate::inspect::trace::{Recorded, StepBlock};
 use crate::nn::attention::{Attention, AttentionWorkspace, Bias, CrossKeys, Held, SelfKeys, Subset};
@@ -74,7 +74,7 @@ pub(crate) struct Pass<'a> {
     /// Sequences for each observation, with equally many rows.
     pub samples: usize,
     /// The rows that there are, and the changes by Euler step.
-    pub changes: &'a Changes<'a>,
+    pub compiled: &'a CompiledInterventions<'a>,
     pub step: usize,
     pub rows: ActiveRows,
 }
@@ -249,7 +249,7 @@ impl Dit {
     ) -> Result<Rows<'a>> {
         workspace.held.resize_with(self.blocks.len(), Vec::new);
         let DitInput { h, action, times } = input;
-        let groups = &pass.changes.extent.groups;
+        let groups = &pass.compiled.sizes.groups;
         let last = self.blocks.len() - 1;
         for index in 0..self.blocks.len() {
             check_interrupted()?;
@@ -328,10 +328,8 @@ impl Dit {
         let normed = y.rows(x.num_rows(), self.width)?;
         norm.apply(kernels.engine, times, x.as_rows(), normed)?;
         let y = Sequences::new(y.as_rows(), call.sequences());
-        let bias = Bias {
-            keys: None,
-            shared: pass.changes.bias(pass.step, index, first_row),
-        };
+        let bias = pass.compiled.bias(pass.step, index, first_row);
+        let bias = bias.map_or(Bias::None, Bias::Shared);
         let probabilities = recorded.attention(call.step_block());
         if let Some(reads) = block.reads {
             let subset = pass.context.positions(reads).map(|positions| Subset {
@@ -393,7 +391,7 @@ impl Dit {
         layer_norm(kernels.engine, BLOCK_EPS, None, x.as_rows(), y.reborrow())?;
         let feed_forward = &self.blocks[index].feed_forward;
         feed_forward.add(kernels, y.as_rows(), hidden, x.reborrow())?;
-        pass.changes
+        pass.compiled
             .patch(pass.step, index, first_row, pass.samples, x.reborrow());
         if let Some(recorded) = recorded.hidden(call.step_block()) {
             RowsMut::new(recorded, self.width).copy_from(x.as_rows());

@@ -121,7 +121,16 @@ impl ActionHead {
         recorded: &mut Recorded<StepBlock>,
         workspace: &mut Workspace,
     ) -> Result<()> {
-        let times = &mut workspace.input.times;
+        let Workspace {
+            embodiment_ids,
+            input,
+            x,
+            action_hidden,
+            action,
+            linear,
+            ..
+        } = &mut *workspace;
+        let times = &mut input.times;
         times.clear();
         reserve("activations", times, pass.context.batch)?;
         let mut last = None;
@@ -134,25 +143,6 @@ impl ActionHead {
                 times.push(Arc::clone(&times[observation - 1]));
             }
         }
-        self.encode_actions(timestep, workspace)?;
-        self.assemble_rows(pass, workspace)?;
-        self.decode(pass, recorded, workspace)
-    }
-
-    /// Action rows, to `workspace.action`.
-    pub(super) fn encode_actions(
-        &self,
-        timestep: impl Fn(usize) -> usize,
-        workspace: &mut Workspace,
-    ) -> Result<()> {
-        let Workspace {
-            embodiment_ids,
-            x,
-            action_hidden,
-            action,
-            linear,
-            ..
-        } = workspace;
         let kernels = &mut Kernels::new(self.engine, linear);
         let encoder = &self.layers.action_encoder;
         encoder.encode(
@@ -162,7 +152,9 @@ impl ActionHead {
             timestep,
             action_hidden,
             action,
-        )
+        )?;
+        self.assemble_rows(pass, workspace)?;
+        self.decode(pass, recorded, workspace)
     }
 
     /// `[state, future, action]` for each sequence, or those of them that run, to the transformer's residual
@@ -176,8 +168,8 @@ impl ActionHead {
             input.action.rows(action.num_rows(), width)?.copy_from(action);
             return Ok(());
         }
-        let groups = &pass.changes.extent.groups;
-        let future = Rows::new(pass.changes.extent.future_tokens, width);
+        let groups = &pass.compiled.sizes.groups;
+        let future = Rows::new(pass.compiled.sizes.future_tokens, width);
         let sequences = pass.context.batch * pass.samples;
         let mut h = input.h.rows(sequences * groups.num_rows(), width)?;
         for sequence in 0..sequences {

@@ -11,14 +11,15 @@ use super::layers::HeadLayers;
 use super::plan::{is_unused, reading_order, specs_of};
 use super::state_dropout::{STATE_DROPOUT, StateDropout, reads_state_dropout};
 use crate::config::HeadConfig;
-use crate::engine::Engine;
+use crate::engine::{Engine, next_id};
 use crate::error::{Error, Result, problem};
 use crate::nn::source::Source;
 use crate::nn::source::file::FileSource;
 use crate::nn::source::memory::{self, MemorySource, TensorViews};
-use crate::nn::weights::Builder;
+use crate::nn::weights;
 use crate::precision::Precision;
 use crate::recognise::HeadCheckpoint;
+use crate::workspaces::Workspaces;
 
 /// Options of loading a head.
 ///
@@ -142,7 +143,7 @@ impl ActionHead {
             ids: &embodiment_ids,
             count: config.num_embodiments,
         };
-        let ((state_dropout, layers), nbytes) = Builder::build(source, engine, |weights| {
+        let ((state_dropout, layers), nbytes) = weights::build(source, engine, |weights| {
             // First, since it is small and may be refused.
             let state_dropout = match drops_states {
                 true => StateDropout::read(weights, config.num_embodiments)?,
@@ -150,13 +151,15 @@ impl ActionHead {
             };
             Ok((state_dropout, HeadLayers::new(weights, &config, embodiments)?))
         })?;
-        Ok(Self::new(
+        Ok(Self {
             config,
             engine,
+            id: next_id(),
             embodiment_ids,
             layers,
             state_dropout,
             nbytes,
-        ))
+            workspaces: Workspaces::new(),
+        })
     }
 }

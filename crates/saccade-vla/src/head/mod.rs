@@ -16,8 +16,6 @@ pub(crate) mod load;
 pub(crate) mod plan;
 pub(crate) mod sample;
 pub(crate) mod state_dropout;
-#[cfg(test)]
-mod tests;
 mod trace;
 pub(crate) mod velocity;
 mod vl_encoder;

@@ -6,7 +6,7 @@ use super::dit::{ActiveRows, Pass};
 use super::flow_matching::Steps;
 use crate::array::{Array, ArrayMut};
 use crate::error::{Error, Result, problem};
-use crate::inspect::changes::Changes;
+use crate::inspect::compiled::CompiledInterventions;
 use crate::inspect::intervention::Intervention;
 use crate::inspect::trace::Recorded;
 use crate::sampling::chunking::Chunking;
@@ -33,7 +33,7 @@ pub struct Sampling<'a> {
     pub future_refresh: Option<usize>,
     /// The previous chunk, and how this one begins with its end; none starts from noise alone.
     pub chunking: Option<Chunking<'a>>,
-    /// Changes inside the head. Cuts and biases act on the rows that run; a patch of rows that do not is an
+    /// CompiledInterventions inside the head. Cuts and biases act on the rows that run; a patch of rows that do not is an
     /// error.
     pub interventions: &'a [Intervention],
 }
@@ -89,13 +89,13 @@ impl ActionHead {
             integrator: sampling.integrator,
             refresh: check_refresh(sampling.future_refresh)?,
         };
-        let extent = self.extent(sampling.interventions, context, num_steps)?;
-        let changes = Changes::new(sampling.interventions, extent)?;
-        changes.check_refresh(steps.refresh, sampling.integrator.evaluations())?;
+        let sizes = self.call_sizes(sampling.interventions, context, num_steps)?;
+        let compiled = CompiledInterventions::new(sampling.interventions, sizes)?;
+        compiled.check_refresh(steps.refresh, sampling.integrator.evaluations())?;
         let pass = Pass {
             context,
             samples,
-            changes: &changes,
+            compiled: &compiled,
             step: 0,
             rows: ActiveRows::Needed,
         };

@@ -8,7 +8,7 @@ use super::sample::Sampling;
 use crate::alloc::filled;
 use crate::array::{Array, OwnedArray};
 use crate::error::{Error, Result, problem};
-use crate::inspect::changes::Changes;
+use crate::inspect::compiled::CompiledInterventions;
 use crate::inspect::groups::Groups;
 use crate::inspect::trace::{Recorded, Shapes, StepBlock, Trace, TraceOptions};
 use crate::sampling::integrator::Integrator;
@@ -53,8 +53,8 @@ impl ActionHead {
         let num_steps = self.check_num_steps(sampling.num_steps)?;
         let samples = self.check_noise(noise, batch, None)?;
         let seam = self.check_chunking(sampling, batch)?;
-        let extent = self.extent(sampling.interventions, context, num_steps)?;
-        let groups = extent.groups;
+        let sizes = self.call_sizes(sampling.interventions, context, num_steps)?;
+        let groups = sizes.groups;
         let chosen = options.chosen(num_steps, config.num_layers)?;
         let shapes: Vec<_> = chosen
             .into_iter()
@@ -62,11 +62,11 @@ impl ActionHead {
             .collect();
         // Before the interventions are worked out, since that takes memory too.
         let mut recorded = Recorded::allocate("max_bytes", options.record, &shapes, options.max_bytes)?;
-        let changes = Changes::new(sampling.interventions, extent)?;
+        let compiled = CompiledInterventions::new(sampling.interventions, sizes)?;
         let pass = Pass {
             context,
             samples,
-            changes: &changes,
+            compiled: &compiled,
             step: 0,
             rows: ActiveRows::All,
         };

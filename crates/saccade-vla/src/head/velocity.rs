@@ -7,7 +7,7 @@ use super::context::Context;
 use super::dit::{ActiveRows, Pass};
 use crate::array::{Array, ArrayMut};
 use crate::error::Result;
-use crate::inspect::changes::Changes;
+use crate::inspect::compiled::CompiledInterventions;
 use crate::inspect::intervention::Intervention;
 use crate::inspect::trace::Recorded;
 
@@ -47,7 +47,8 @@ impl ActionHead {
         let timesteps = self.check_timestep(noisy.timestep, batch)?;
         let shape = [batch, self.config.action_horizon, self.config.action_dim];
         let out = out.check_shape("out", "(batch, action_horizon, action_dim)", &shape)?;
-        let changes = Changes::new(interventions, self.extent(interventions, context, 1)?)?;
+        let compiled =
+            CompiledInterventions::new(interventions, self.call_sizes(interventions, context, 1)?)?;
         self.with_workspace(|workspace| {
             self.check_embodiments(embodiment_id, batch, &mut workspace.embodiment_ids)?;
             self.encode_state(state, workspace)?;
@@ -58,7 +59,7 @@ impl ActionHead {
             let pass = Pass {
                 context,
                 samples: 1,
-                changes: &changes,
+                compiled: &compiled,
                 step: 0,
                 rows: ActiveRows::Needed,
             };

@@ -223,10 +223,9 @@ impl VlEncoder {
         // The part of `(batch, ...)` that belongs to the observations.
         let part = |size: usize| observations.start * size..observations.end * size;
         let features = tokens.features.rows(part(num_vl_tokens));
-        let bias = Bias {
-            keys: tokens.removed.map(|removed| &removed[part(num_vl_tokens)]),
-            shared: None,
-        };
+        let bias = tokens
+            .removed
+            .map_or(Bias::None, |removed| Bias::Keys(&removed[part(num_vl_tokens)]));
         match &self.vlln {
             Some(vlln) => vlln.apply(kernels.engine, features, vl.reborrow())?,
             None => vl.copy_from(features),

@@ -1,6 +1,6 @@
 //! Whether an intervention fits a call, and acts in it at all.
 
-use super::extent::Extent;
+use super::call_sizes::CallSizes;
 use super::groups::{Group, Tokens, check_indices};
 use super::intervention::Intervention;
 use crate::config::HeadConfig;
@@ -10,11 +10,11 @@ use crate::error::{Error, Result, problem, show_shape};
 ///
 /// # Errors
 /// [`Error::Shape`] and [`Error::Input`] if not.
-pub(super) fn check(intervention: &Intervention, extent: &Extent<'_>) -> Result<()> {
-    let Extent { config, groups, .. } = extent;
+pub(super) fn check(intervention: &Intervention, sizes: &CallSizes<'_>) -> Result<()> {
+    let CallSizes { config, groups, .. } = sizes;
     for (name, indices, count) in [
         ("intervention: blocks", &intervention.blocks, config.num_layers),
-        ("intervention: steps", &intervention.steps, extent.num_steps),
+        ("intervention: steps", &intervention.steps, sizes.num_steps),
         ("intervention: heads", &intervention.heads, config.num_heads),
     ] {
         let Some(indices) = indices else {

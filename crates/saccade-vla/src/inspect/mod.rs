@@ -1,11 +1,9 @@
 //! Looking inside a head: what to change while it runs, and what to keep.
 
-pub(crate) mod changes;
+pub(crate) mod call_sizes;
 mod check;
-pub(crate) mod extent;
+pub(crate) mod compiled;
 pub(crate) mod groups;
 pub(crate) mod intervention;
 pub mod linalg;
-#[cfg(test)]
-mod tests;
 pub(crate) mod trace;

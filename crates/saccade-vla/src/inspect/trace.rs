@@ -171,41 +171,15 @@ impl TraceOptions {
 mod tests {
     use super::*;
 
-    const BOTH: Keep = Keep {
-        attention: true,
-        hidden: true,
-    };
-
-    #[test]
-    fn one_byte_too_much_is_refused() {
-        let keys = || {
-            [0, 2].map(|block| {
-                let (attention, hidden) = ([2, 3, 4, 5], [2, 4, 7]);
-                (block, Shapes { attention, hidden })
-            })
-        };
-        let bytes = 2 * 4 * (2 * 3 * 4 * 5 + 2 * 4 * 7);
-        let recorded = Recorded::allocate("max_bytes", BOTH, &keys(), bytes).unwrap();
-        assert_eq!(recorded.attention[&2].shape(), [2, 3, 4, 5]);
-        assert_eq!(recorded.hidden[&0].data().len(), 2 * 4 * 7);
-        assert_eq!(
-            Recorded::allocate("max_bytes", BOTH, &keys(), bytes - 1)
-                .unwrap_err()
-                .to_string(),
-            format!(
-                "max_bytes: what is to be recorded takes {bytes} bytes, expected at most {}; record less at a time",
-                bytes - 1
-            )
-        );
-        let nothing = Recorded::allocate("max_bytes", Keep::default(), &keys(), 0).unwrap();
-        assert!(nothing.attention.is_empty() && nothing.hidden.is_empty());
-    }
-
     #[test]
     fn sizes_beyond_64_bits_are_refused() {
         let (attention, hidden) = ([1 << 20; 4], [1 << 20; 3]);
-        let error = Recorded::allocate("max_bytes", BOTH, &[(0, Shapes { attention, hidden })], u64::MAX)
-            .unwrap_err();
+        let both = Keep {
+            attention: true,
+            hidden: true,
+        };
+        let shapes = [(0, Shapes { attention, hidden })];
+        let error = Recorded::allocate("max_bytes", both, &shapes, u64::MAX).unwrap_err();
         let bytes = (1_u128 << 82) + (1 << 62);
         assert!(
             error

@@ -77,13 +77,15 @@ pub(crate) struct Held<'a> {
     pub first: usize,
 }
 
-/// Biases of the logits.
-#[derive(Clone, Copy, Debug, Default)]
-pub(crate) struct Bias<'a> {
+/// What is added to the logits.
+#[derive(Clone, Copy, Default)]
+pub(crate) enum Bias<'a> {
+    #[default]
+    None,
     /// `(groups, keys)`: each group's own, for all of its heads and queries.
-    pub keys: Option<&'a [f32]>,
+    Keys(&'a [f32]),
     /// The same for every sequence of queries.
-    pub shared: Option<LogitBias<'a>>,
+    Shared(LogitBias<'a>),
 }
 
 impl Bias<'_> {
@@ -96,17 +98,19 @@ impl Bias<'_> {
         [heads, queries, keys]: [usize; 3],
         memory: &'s mut Vec<f32>,
     ) -> Result<Option<LogitBias<'s>>> {
-        let own = self.keys.map(|all| &all[group * keys..(group + 1) * keys]);
-        let shared = match (own, self.shared) {
-            (_, Some(shared)) if own.is_some() || positions.is_some() => shared,
-            (Some(values), _) => {
+        let shared = match *self {
+            Self::None => return Ok(None),
+            Self::Keys(all) => {
                 return Ok(Some(LogitBias {
-                    values,
+                    values: &all[group * keys..(group + 1) * keys],
                     head_stride: 0,
                     query_stride: 0,
                 }));
             }
-            (None, shared) => return Ok(shared),
+            Self::Shared(shared) => shared,
+        };
+        let Some(positions) = positions else {
+            return Ok(Some(shared));
         };
         let heads = if shared.head_stride == 0 { 1 } else { heads };
         memory.clear();
@@ -114,10 +118,7 @@ impl Bias<'_> {
         reserve("activations", memory, len)?;
         for (head, query) in (0..heads).flat_map(|head| (0..queries).map(move |query| (head, query))) {
             let row = &shared.values[head * shared.head_stride + query * shared.query_stride..];
-            memory.extend((0..keys).map(|key| {
-                let shared = row[positions.map_or(key, |positions| positions[key])];
-                own.map_or(shared, |own| shared + own[key])
-            }));
+            memory.extend(positions.iter().map(|&position| row[position]));
         }
         Ok(Some(LogitBias {
             values: memory,
@@ -217,7 +218,11 @@ impl Attention {
         // A shared bias is one sequence's, so each sequence is then a call of its own; otherwise those that
         // read the same keys share one.
         let of_group = y.count / caches.len();
-        let together = if bias.shared.is_some() { 1 } else { of_group };
+        let together = if matches!(bias, Bias::Shared(_)) {
+            1
+        } else {
+            of_group
+        };
         for first in (0..y.count).step_by(together) {
             let group = first / of_group;
             let (cache, rows) = (&caches[group], y.range(first..first + together));
@@ -320,56 +325,4 @@ fn of_sequence<'a>(
     let size: usize = shape.iter().product();
     all.as_deref_mut()
         .map(|all| &mut all[sequence * size..(sequence + 1) * size])
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn both_kinds_of_bias_add_up() {
-        let own = [1.0, 2.0, f32::NEG_INFINITY, 4.0]; // two groups of two keys
-        let shared = [10.0, 20.0, 30.0, 40.0, 50.0, 60.0, 70.0, 80.0]; // (heads, queries, keys)
-        let mut sum = Vec::new();
-        let rows = |bias: LogitBias<'_>| {
-            [(0, 0), (0, 1), (1, 0), (1, 1)].map(|(head, query)| {
-                let first = head * bias.head_stride + query * bias.query_stride;
-                [bias.values[first], bias.values[first + 1]]
-            })
-        };
-        let bias = |keys, head_stride| Bias {
-            keys,
-            shared: Some(LogitBias {
-                values: &shared,
-                head_stride,
-                query_stride: 2,
-            }),
-        };
-        let mut of =
-            |bias: Bias<'_>, group| rows(bias.of(group, None, [2, 2, 2], &mut sum).unwrap().unwrap());
-        assert_eq!(
-            of(bias(None, 4), 1),
-            [[10.0, 20.0], [30.0, 40.0], [50.0, 60.0], [70.0, 80.0]]
-        );
-        assert_eq!(
-            of(bias(Some(&own), 4), 0),
-            [[11.0, 22.0], [31.0, 42.0], [51.0, 62.0], [71.0, 82.0]]
-        );
-        let removed = f32::NEG_INFINITY;
-        assert_eq!(
-            of(bias(Some(&own), 0), 1),
-            [[removed, 24.0], [removed, 44.0], [removed, 24.0], [removed, 44.0]]
-        );
-        let keys_only = Bias {
-            keys: Some(&own),
-            shared: None,
-        };
-        assert_eq!(of(keys_only, 0), [[1.0, 2.0]; 4]);
-        assert!(
-            Bias::default()
-                .of(0, None, [2, 2, 2], &mut sum)
-                .unwrap()
-                .is_none()
-        );
-    }
 }

@@ -10,6 +10,4 @@ pub(crate) mod norm;
 pub(crate) mod rope;
 pub(crate) mod sequences;
 pub(crate) mod source;
-#[cfg(test)]
-mod tests;
 pub(crate) mod weights;

@@ -15,43 +15,30 @@ use crate::error::{Error, Result, problem, show_shape};
 use crate::ops::{check_interrupted, packing_error};
 use crate::precision::Role;
 
-/// Builds all layers of one model.
-pub(crate) struct Builder<'a> {
+/// What all layers of one model are made of, and their bytes so far.
+struct Builder<'a> {
     source: &'a dyn Source,
     engine: Engine,
     nbytes: Cell<usize>,
 }
 
-impl<'a> Builder<'a> {
-    pub(crate) fn new(source: &'a dyn Source, engine: Engine) -> Self {
-        Self {
-            source,
-            engine,
-            nbytes: Cell::new(0),
-        }
-    }
-
-    /// The weights of the whole model.
-    pub(crate) fn weights(&self) -> Weights<'_> {
-        Weights {
-            builder: self,
-            path: String::new(),
-        }
-    }
-
-    /// The layers that `build` makes of a source, and their bytes.
-    ///
-    /// # Errors
-    /// Those of `build`.
-    pub(crate) fn build<L>(
-        source: &'a dyn Source,
-        engine: Engine,
-        build: impl FnOnce(&Weights<'_>) -> Result<L>,
-    ) -> Result<(L, usize)> {
-        let builder = Self::new(source, engine);
-        let layers = build(&builder.weights())?;
-        Ok((layers, builder.nbytes.get()))
-    }
+/// The layers that `build` makes of a source, and their bytes.
+///
+/// # Errors
+/// Those of `build`.
+pub(crate) fn build<L>(
+    source: &dyn Source,
+    engine: Engine,
+    build: impl FnOnce(&Weights<'_>) -> Result<L>,
+) -> Result<(L, usize)> {
+    let builder = &Builder {
+        source,
+        engine,
+        nbytes: Cell::new(0),
+    };
+    let path = String::new();
+    let layers = build(&Weights { builder, path })?;
+    Ok((layers, builder.nbytes.get()))
 }
 
 /// The weights below one name.
@@ -97,12 +84,7 @@ impl Weights<'_> {
 
     /// The vector `name`, which will be part of a packed layer. Empty if the source gives an outline.
     pub(crate) fn bias(&self, name: &str, len: usize) -> Result<Vec<f32>> {
-        let bias = self.read(Request {
-            spec: TensorSpec::plain(&self.name(name), &[len]),
-            slices: None,
-            is_given_back: false,
-        })?;
-        bias.into_f32()
+        self.read(self.request(name, &[len]))?.into_f32()
     }
 
     /// The vector `name`, kept as float32. Empty if the source gives an outline.
@@ -115,9 +97,8 @@ impl Weights<'_> {
     pub(crate) fn table(&self, shape: [usize; 2], count: usize) -> Result<OwnedArray> {
         self.count(4 * count * shape[1]);
         let table = self.read(Request {
-            spec: TensorSpec::plain(&self.name("weight"), &shape),
             slices: (count != shape[0]).then_some(0..count),
-            is_given_back: false,
+            ..self.request("weight", &shape)
         })?;
         let table = table.into_f32()?;
         let rows = if table.is_empty() { 0 } else { count };
@@ -127,11 +108,7 @@ impl Weights<'_> {
     /// The table `weight`, whose rows are looked up: as int8 with a scale for each row if that is what is
     /// computed in, in bf16 if that is how it is stored or what is computed in, else in float32.
     pub(crate) fn looked_up(&self, shape: [usize; 2]) -> Result<Tensor> {
-        let table = self.read(Request {
-            spec: TensorSpec::plain(&self.name("weight"), &shape),
-            slices: None,
-            is_given_back: false,
-        })?;
+        let table = self.read(self.request("weight", &shape))?;
         let [rows, width] = shape;
         let is_int8 = self.engine().precision.quantizes_tables();
         let table = match table {
@@ -201,6 +178,15 @@ impl Weights<'_> {
     pub(crate) fn give_back(&self, used: Tensor) {
         if let Tensor::Held(elements) = used {
             self.builder.source.give_back(elements);
+        }
+    }
+
+    /// A request of a whole tensor that is kept.
+    fn request(&self, name: &str, shape: &[usize]) -> Request {
+        Request {
+            spec: TensorSpec::plain(&self.name(name), shape),
+            slices: None,
+            is_given_back: false,
         }
     }
 

@@ -9,7 +9,7 @@ use saccade_vla_kernels::Isa;
 use super::{Request, Source, Stored, Tensor};
 use crate::engine::Engine;
 use crate::error::Result;
-use crate::nn::weights::{Builder, Weights};
+use crate::nn::weights::{self, Weights};
 use crate::precision::Precision;
 
 /// Notes every request.
@@ -39,7 +39,7 @@ pub(crate) fn plan<L>(build: impl FnOnce(&Weights<'_>) -> Result<L>) -> Result<P
         threads: 1,
         precision: Precision::default(),
     };
-    build(&Builder::new(&planner, engine).weights())?;
+    weights::build(&planner, engine, build)?;
     Ok(planner.plan.into_inner())
 }
 

@@ -6,7 +6,7 @@ use safetensors::Dtype;
 use super::{Outline, Request, Source, Stored, Tensor};
 use crate::engine::Engine;
 use crate::error::Result;
-use crate::nn::weights::{Builder, Weights};
+use crate::nn::weights::{self, Weights};
 use crate::ops::packing_error;
 use crate::precision::Role;
 
@@ -25,7 +25,7 @@ pub(crate) fn nbytes<L>(
     dtype: impl Fn(&str) -> Result<Dtype>,
     build: impl FnOnce(&Weights<'_>) -> Result<L>,
 ) -> Result<usize> {
-    let (_, nbytes) = Builder::build(&Sizer { dtype, engine }, engine, build)?;
+    let (_, nbytes) = weights::build(&Sizer { dtype, engine }, engine, build)?;
     Ok(nbytes)
 }
 

@@ -5,25 +5,25 @@ use std::collections::btree_map::Entry;
 
 use saccade_vla_kernels::{LogitBias, RowsMut};
 
+use super::call_sizes::CallSizes;
 use super::check::{check, check_not_empty, is_read};
-use super::extent::Extent;
 use super::groups::{Group, Groups, check_indices};
 use super::intervention::{Intervention, Patch};
 use crate::alloc::{filled, product, reserve};
 use crate::error::{Error, Result, problem, show_shape};
 
 /// All interventions of one call, in the form in which blocks use them.
-pub(crate) struct Changes<'a> {
-    pub extent: Extent<'a>,
+pub(crate) struct CompiledInterventions<'a> {
+    pub sizes: CallSizes<'a>,
     /// Those of one kind of block in which the same interventions act.
-    pub(super) biases: Vec<DenseBias>,
+    biases: Vec<DenseBias>,
     /// Which of the biases acts, by step and block; empty if none ever does.
     acting: Vec<Option<usize>>,
     patches: Vec<PatchedRows<'a>>,
 }
 
 /// What is added to the logits of one kind of block, `(heads, rows, keys)`; a single head if it is the same for all of them.
-pub(super) struct DenseBias {
+struct DenseBias {
     values: Vec<f32>,
     heads: usize,
     rows: usize,
@@ -43,29 +43,29 @@ struct PatchedRows<'a> {
 /// Bytes of biases that one call may hold: some two hundred, each different for every head, at N1.5's size with three cameras.
 const MAX_BIAS_BYTES: u128 = 1 << 30;
 
-impl<'a> Changes<'a> {
+impl<'a> CompiledInterventions<'a> {
     /// Checks the interventions and works out where each acts. With none of them nothing is allocated.
     ///
     /// # Errors
     /// [`Error::Shape`] and [`Error::Input`] for what does not fit the call.
-    pub(crate) fn new(interventions: &'a [Intervention], extent: Extent<'a>) -> Result<Self> {
-        let mut changes = Self {
-            extent,
+    pub(crate) fn new(interventions: &'a [Intervention], sizes: CallSizes<'a>) -> Result<Self> {
+        let mut compiled = Self {
+            sizes,
             biases: Vec::new(),
             acting: Vec::new(),
             patches: Vec::new(),
         };
         for intervention in interventions {
-            check(intervention, &extent)?;
+            check(intervention, &sizes)?;
             for patch in &intervention.patch {
-                changes.patches.push(PatchedRows::new(patch, &extent)?);
+                compiled.patches.push(PatchedRows::new(patch, &sizes)?);
             }
         }
         let adds = |one: &Intervention| !one.cut.is_empty() || !one.key_bias.is_empty();
-        if extent.future_key_bias.is_some() || interventions.iter().any(adds) {
-            changes.find_biases(interventions)?;
+        if sizes.future_key_bias.is_some() || interventions.iter().any(adds) {
+            compiled.find_biases(interventions)?;
         }
-        Ok(changes)
+        Ok(compiled)
     }
 
     /// That no row is patched at a step at which it does not run: at evaluations of the velocity that `refresh` does not divide only
@@ -74,7 +74,7 @@ impl<'a> Changes<'a> {
     /// # Errors
     /// [`Error::Input`] for such a patch.
     pub(crate) fn check_refresh(&self, refresh: usize, in_step: usize) -> Result<()> {
-        let actions = self.extent.groups.range(Group::Action).start;
+        let actions = self.sizes.groups.range(Group::Action).start;
         let stays = |patch: &&PatchedRows<'_>| {
             let mut evaluations = patch.step * in_step..(patch.step + 1) * in_step;
             patch.rows.iter().any(|row| *row < actions)
@@ -93,16 +93,16 @@ impl<'a> Changes<'a> {
     /// Blocks of one kind in which the same interventions act share a bias.
     fn find_biases(&mut self, interventions: &[Intervention]) -> Result<()> {
         let mut known: BTreeMap<(bool, Vec<usize>), usize> = BTreeMap::new();
-        let config = self.extent.config;
-        let count = product("intervention", &[self.extent.num_steps, config.num_layers])?;
+        let config = self.sizes.config;
+        let count = product("intervention", &[self.sizes.num_steps, config.num_layers])?;
         reserve("intervention", &mut self.acting, count)?;
-        for step in 0..self.extent.num_steps {
+        for step in 0..self.sizes.num_steps {
             for block in 0..config.num_layers {
                 let is_cross = config.is_cross(block);
                 let acting: Vec<usize> = (0..interventions.len())
                     .filter(|&index| acts(&interventions[index], step, block, is_cross))
                     .collect();
-                let has_own = !is_cross && self.extent.future_key_bias.is_some();
+                let has_own = !is_cross && self.sizes.future_key_bias.is_some();
                 let index = if acting.is_empty() && !has_own {
                     None
                 } else {
@@ -124,7 +124,7 @@ impl<'a> Changes<'a> {
 
     /// The sum of what `acting` add in blocks of one kind, and of what these have of their own.
     fn sum(&self, acting: &[&Intervention], is_cross: bool) -> Result<DenseBias> {
-        let Extent { groups, config, .. } = self.extent;
+        let CallSizes { groups, config, .. } = self.sizes;
         let rows = groups.num_rows();
         let keys = if is_cross { groups.vl } else { rows };
         let everywhere = acting.iter().all(|one| one.heads.is_none());
@@ -144,7 +144,7 @@ impl<'a> Changes<'a> {
             rows,
             keys,
         };
-        if let Some(own) = self.extent.future_key_bias.filter(|_| !is_cross) {
+        if let Some(own) = self.sizes.future_key_bias.filter(|_| !is_cross) {
             for row in bias.values.chunks_exact_mut(keys) {
                 row[groups.range(Group::Future)].copy_from_slice(own);
             }
@@ -167,7 +167,7 @@ impl<'a> Changes<'a> {
 
     /// What is added to the logits of `block` at `step`, for the rows from `first_row` on.
     pub(crate) fn bias(&self, step: usize, block: usize, first_row: usize) -> Option<LogitBias<'_>> {
-        let acting = self.acting.get(step * self.extent.config.num_layers + block)?;
+        let acting = self.acting.get(step * self.sizes.config.num_layers + block)?;
         let bias = &self.biases[(*acting)?];
         Some(LogitBias {
             values: &bias.values[first_row * bias.keys..],
@@ -186,7 +186,7 @@ impl<'a> Changes<'a> {
         samples: usize,
         mut x: RowsMut<'_>,
     ) {
-        let Extent { groups, config, .. } = self.extent;
+        let CallSizes { groups, config, .. } = self.sizes;
         let sequence_len = groups.num_rows() - first_row;
         let patches = self.patches.iter();
         for patch in patches.filter(|patch| (patch.step, patch.block) == (step, block)) {
@@ -259,10 +259,10 @@ impl DenseBias {
 impl<'a> PatchedRows<'a> {
     /// # Errors
     /// [`Error::Shape`] and [`Error::Input`] for a patch that does not fit the call.
-    fn new(patch: &'a Patch, extent: &Extent<'_>) -> Result<Self> {
-        let Extent { config, groups, .. } = extent;
+    fn new(patch: &'a Patch, sizes: &CallSizes<'_>) -> Result<Self> {
+        let CallSizes { config, groups, .. } = sizes;
         let width = config.width;
-        check_indices("patch: step", &[patch.step], extent.num_steps)?;
+        check_indices("patch: step", &[patch.step], sizes.num_steps)?;
         check_indices("patch: block", &[patch.block], config.num_layers)?;
         if patch.tokens.group == Group::Vl {
             return Err(Error::Input(problem!(
@@ -274,12 +274,12 @@ impl<'a> PatchedRows<'a> {
         check_not_empty(&name, &patch.tokens, count)?;
         let element_stride = match patch.rows.shape() {
             shape if shape == [count, width] => 0,
-            shape if shape == [extent.batch, count, width] => count * width,
+            shape if shape == [sizes.batch, count, width] => count * width,
             shape => {
                 return Err(Error::Shape(problem!(
                     name;
                     expected "(tokens, width) = {} or (batch, tokens, width) = {} for {}",
-                    show_shape(&[count, width]), show_shape(&[extent.batch, count, width]), patch.tokens.group.name();
+                    show_shape(&[count, width]), show_shape(&[sizes.batch, count, width]), patch.tokens.group.name();
                     got "{}", show_shape(shape)
                 )));
             }
@@ -291,5 +291,29 @@ impl<'a> PatchedRows<'a> {
             values: patch.rows.view().check_finite(&name)?.data(),
             element_stride,
         })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::config::HeadConfig;
+    use crate::inspect::groups::Tokens;
+
+    #[test]
+    fn blocks_of_one_kind_share_a_bias() {
+        let config = HeadConfig::from_json(include_str!("../../examples/tiny/config.json")).unwrap();
+        let all = |group| Tokens { group, indices: None };
+        let interventions = [Intervention {
+            cut: vec![
+                (all(Group::Action), all(Group::Future)),
+                (all(Group::Future), all(Group::Vl)),
+            ],
+            ..Intervention::default()
+        }];
+        let learned = vec![0.0; config.num_future_tokens * config.width];
+        let sizes = CallSizes::new(&config, &learned, &interventions, [1, 5], 3).unwrap();
+        let compiled = CompiledInterventions::new(&interventions, sizes).unwrap();
+        assert_eq!(compiled.biases.len(), 2, "at all steps");
     }
 }

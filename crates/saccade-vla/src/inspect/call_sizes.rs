@@ -7,7 +7,7 @@ use crate::error::{Error, Result, problem, show_shape};
 
 /// The sizes of one call.
 #[derive(Clone, Copy)]
-pub(crate) struct Extent<'a> {
+pub(crate) struct CallSizes<'a> {
     pub config: &'a HeadConfig,
     pub batch: usize,
     pub num_steps: usize,
@@ -18,7 +18,7 @@ pub(crate) struct Extent<'a> {
     pub groups: Groups,
 }
 
-impl<'a> Extent<'a> {
+impl<'a> CallSizes<'a> {
     /// # Errors
     /// [`Error::Shape`] and [`Error::Input`] for future tokens that cannot replace the learned ones.
     pub(crate) fn new(

@@ -1,22 +1,18 @@
-//! Arguments that are written to are checked as those that are read.
+//! Arguments are checked: those that are written to as those that are read.
 
-use std::path::Path;
+mod common;
 
 use saccade_vla::{
     ActionHead, Array, ArrayMut, CrossAttention, ElementsRef, Error, Features, KeyOptions, LoadOptions,
-    NoisyActions, Precision, Sampling, TensorView, TensorViews,
+    NoisyActions, OwnedArray, Precision, Sampling, TensorView, TensorViews,
 };
 
 fn demo() -> ActionHead {
-    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../python/saccade/checkpoints/demo");
-    ActionHead::load(
-        &path,
-        &LoadOptions {
-            num_threads: Some(1),
-            ..LoadOptions::default()
-        },
-    )
-    .unwrap()
+    let options = LoadOptions {
+        num_threads: Some(1),
+        ..LoadOptions::default()
+    };
+    ActionHead::load(&common::demo(), &options).unwrap()
 }
 
 #[test]
@@ -114,5 +110,54 @@ fn outputs_of_a_cross_attention_are_checked() {
             "{out_shape:?}, {weights_shape:?}"
         );
         assert!(out.iter().chain(&weights).all(|value| *value == 7.0));
+    }
+}
+
+#[test]
+fn every_kind_of_bad_element_is_found_and_named_wherever_it_is() {
+    let head = demo();
+    let width = head.config().context_dim;
+    let shape = [2, 2100 / width + 1, width];
+    let mut features = vec![1e30; shape.iter().product()];
+    for bad in [f32::NAN, f32::INFINITY, f32::NEG_INFINITY, -f32::NAN] {
+        for position in [0, 1, 1023, 1024, 2053, features.len() - 1] {
+            features[position] = bad;
+            let error = head
+                .encode(&Features::new(Array::new(&features, &shape).unwrap()))
+                .err()
+                .unwrap();
+            features[position] = 1e30;
+            let token = position / width;
+            let index = format!(
+                "({}, {}, {})",
+                token / shape[1],
+                token % shape[1],
+                position % width
+            );
+            assert_eq!(
+                error.to_string(),
+                format!("backbone_features: expected finite values, got {bad} at index {index}")
+            );
+        }
+    }
+}
+
+#[test]
+fn a_shape_that_does_not_fit_is_an_error() {
+    let mut data = [0.0; 6];
+    let largest = format!("({}, 2)", usize::MAX);
+    for (shape, shown) in [
+        (&[2, 2][..], "(2, 2)"),
+        (&[], "()"),
+        (&[usize::MAX, 2], &largest),
+        (&[7], "(7,)"),
+    ] {
+        let messages = [
+            Array::new(&data, shape).unwrap_err().to_string(),
+            OwnedArray::new(data.to_vec(), shape).unwrap_err().to_string(),
+            ArrayMut::new(&mut data, shape).unwrap_err().to_string(),
+        ];
+        let expected = format!("shape: {shown} does not fit 6 elements");
+        assert_eq!(messages, [expected.clone(), expected.clone(), expected]);
     }
 }
