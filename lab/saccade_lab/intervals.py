@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from scipy.stats import binomtest
 
+from saccade._internal.bootstrap import CONFIDENCE
 from saccade.errors import InputError
-
-CONFIDENCE = 0.95
 
 
 def wilson(successes: int, trials: int) -> tuple[float, float]:

@@ -39,6 +39,8 @@ from saccade.robots.normalizer import Normalizer
 
 if TYPE_CHECKING:
     from saccade.checkpoints import convert, demo_checkpoint, inspect, quantize, resize
+    from saccade.diagnosis import diagnose
+    from saccade.evaluation import evaluate
     from saccade.integrations import accelerate
 
 __all__ = [
@@ -71,6 +73,8 @@ __all__ = [
     "accelerate",
     "convert",
     "demo_checkpoint",
+    "diagnose",
+    "evaluate",
     "inspect",
     "quantize",
     "resize",
@@ -81,11 +85,15 @@ __all__ = [
 _FUNCTIONS = {
     **dict.fromkeys(("convert", "demo_checkpoint", "inspect", "quantize", "resize"), "saccade.checkpoints"),
     "accelerate": "saccade.integrations",
+    "diagnose": "saccade.diagnosis",
+    "evaluate": "saccade.evaluation",
 }
 #: Public submodules, likewise.
 _SUBMODULES = (
     "checkpoints",
     "datasets",
+    "diagnosis",
+    "evaluation",
     "integrations",
     "linalg",
     "observations",

@@ -22,7 +22,18 @@ ROOT = Path(__file__).resolve().parents[2]
 FILE = Path(__file__).with_name("public_api.txt")
 
 #: The documented submodules.
-SUBMODULES = ("checkpoints", "datasets", "integrations", "linalg", "observations", "robots", "serve", "torch")
+SUBMODULES = (
+    "checkpoints",
+    "datasets",
+    "diagnosis",
+    "evaluation",
+    "integrations",
+    "linalg",
+    "observations",
+    "robots",
+    "serve",
+    "torch",
+)
 
 #: Special methods that are part of the surface.
 CALLED = ("__init__", "__call__", "__enter__", "__exit__", "__len__", "__iter__", "__getitem__")

@@ -32,6 +32,9 @@ from saccade.errors import SaccadeError
 COMMANDS: dict[str, str] = {
     "act": "run a whole checkpoint on images and an instruction",
     "serve": "serve a whole checkpoint to robots and simulators over the network",
+    "evaluate": "compare a checkpoint's actions with recorded ones",
+    "certify": "check on this machine what `saccade evaluate --certify` recorded",
+    "diagnose": "say which inputs a checkpoint uses: instruction, cameras, state",
     "inspect": "show what a checkpoint contains",
     "resize": "write a checkpoint with another number of future tokens",
     "convert": "write a checkpoint with other embodiments, dtype or shards, or merge a LoRA adapter",
@@ -58,6 +61,9 @@ ENTRY_POINTS = "saccade.commands"
 NEEDS: dict[str, tuple[str, ...]] = {
     "act": ("rich", "PIL"),
     "serve": ("zmq", "msgpack"),
+    "evaluate": ("pyarrow", "av"),
+    "certify": ("pyarrow", "av"),
+    "diagnose": ("pyarrow", "av"),
     "inspect --precision-check": ("PIL",),
 }
 

@@ -1,0 +1,151 @@
+"""What `saccade evaluate`, `certify` and `diagnose` share: flags, and episodes in one process or in many."""
+
+from __future__ import annotations
+
+import argparse
+import importlib.metadata
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+from saccade._internal import extras
+from saccade._internal import flags as arguments
+from saccade._internal.flags import UsageError, add_policy_options, policy_options
+from saccade.cli import LAB, output
+
+if TYPE_CHECKING:
+    from saccade.evaluation.episode_files import EpisodeFiles
+    from saccade.evaluation.source import Source
+
+Record = TypeVar("Record")
+
+#: Entry points of the lab: what it adds to these commands.
+EXTENSIONS = "saccade.extensions"
+
+
+def add_recordings(parser: argparse.ArgumentParser) -> None:
+    """Declares the recordings."""
+    parser.add_argument(
+        "recordings", metavar="DATASET", help="directory or published id of a LeRobotDataset (extra: data)"
+    )
+
+
+def add_run(parser: argparse.ArgumentParser, episodes: str) -> None:
+    """Declares checkpoint, recordings, episodes, processes and the directory of the results."""
+    arguments.add_checkpoint_argument(parser)
+    add_recordings(parser)
+    arguments.add_list(parser, "--episodes", item=int, metavar="N", minimum=0, help=episodes)
+    arguments.add_seed(parser, "seed of the noise")
+    arguments.add_out(parser, None)
+    arguments.add_json(parser, "print results.json instead of a table")
+    add_policy_options(parser)
+    arguments.add_num_threads(parser, "threads (default: the physical cores; with several processes 1)")
+    several = parser.add_argument_group("several processes (need the lab)")
+    several.add_argument(
+        "--jobs",
+        type=int,
+        metavar="N",
+        help="episodes computed at the same time, in processes of their own; -1 for one per core (default: "
+        "1; with ray -1)",
+    )
+    several.add_argument(
+        "--backend",
+        choices=("loky", "ray"),
+        default="loky",
+        help="processes on this machine, or on a Ray cluster (default: loky)",
+    )
+    several.add_argument("--address", metavar="ADDRESS", help="address of the Ray cluster")
+
+
+def source_of(args: argparse.Namespace) -> Source:
+    """Checkpoint and recordings of the arguments."""
+    from saccade.evaluation.source import Source
+
+    options = policy_options(args)
+    if is_spread(args) and options["num_threads"] is None:
+        options["num_threads"] = 1
+    return Source.of(args.checkpoint, args.recordings, options)
+
+
+def is_spread(args: argparse.Namespace) -> bool:
+    """Whether other processes compute."""
+    return args.backend != "loky" or args.jobs not in (None, 1) or args.address is not None
+
+
+def extension(name: str) -> Callable[..., Any] | None:
+    """What the lab adds to a command, by the name of its entry point; None if the lab is not installed."""
+    try:
+        found = importlib.metadata.distribution(LAB).entry_points.select(group=EXTENSIONS, name=name)
+    except importlib.metadata.PackageNotFoundError:
+        return None
+    for entry in found:
+        loaded: Callable[..., Any] = entry.load()
+        return loaded
+    return None
+
+
+def check_processes(args: argparse.Namespace) -> None:
+    """Checks that the lab is installed if other processes are wanted.
+
+    Raises:
+        UsageError: It is not; the message says how to install it.
+    """
+    if is_spread(args) and extension("spread") is None:
+        raise UsageError(
+            f"--jobs, --backend: need {LAB}, which is not installed. Install with: "
+            f"{extras.install_lab('sim')}"
+        )
+
+
+def computed(
+    work: Callable[[int], Record],
+    episodes: Sequence[int],
+    files: EpisodeFiles[Record],
+    args: argparse.Namespace,
+    source: Source,
+    description: str,
+) -> list[Record]:
+    """The records of episodes: those of an earlier run, and the others computed, each written at once."""
+    todo = [episode for episode in episodes if files.load(episode) is None]
+    done = len(episodes) - len(todo)
+    with output.progress_bar(description, len(episodes)) as update:
+        update(done)
+        for episode, record in _each(work, todo, args, source):
+            files.save(episode, record)
+            done += 1
+            update(done)
+    return [one for episode in episodes if (one := files.load(episode)) is not None]
+
+
+def _each(
+    work: Callable[[int], Record], todo: Sequence[int], args: argparse.Namespace, source: Source
+) -> Iterator[tuple[int, Record]]:
+    if not is_spread(args):
+        return ((episode, work(episode)) for episode in todo)
+    spread = extension("spread")
+    assert spread is not None
+    paths = [Path(source.checkpoint), Path(source.recordings)]
+    options = [source.options.get(name) for name in ("data_config", "tokenizer")]
+    paths += [Path(option) for option in options if isinstance(option, str)]
+    found: Iterator[tuple[int, Record]] = spread(
+        work,
+        todo,
+        jobs=args.jobs,
+        backend=args.backend,
+        address=args.address,
+        num_threads=args.num_threads,
+        files=[path for path in paths if path.exists()],
+    )
+    return found
+
+
+def write_page(name: str, *given: Any) -> bool:
+    """Lets the lab draw; without it, says on standard error what to install."""
+    draw = extension(name)
+    if draw is None:
+        output.note(
+            "saccade", f"pictures and the page need {LAB}; install it with: {extras.install_lab('sim')}"
+        )
+        return False
+    draw(*given)
+    return True

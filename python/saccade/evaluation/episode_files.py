@@ -1,0 +1,104 @@
+"""The results of single episodes in a directory, so that an interrupted run goes on where it stopped."""
+
+from __future__ import annotations
+
+import json
+import zipfile
+from collections.abc import Mapping
+from dataclasses import fields, is_dataclass
+from pathlib import Path
+from typing import Any, Generic, TypeVar
+
+import numpy as np
+
+from saccade._internal.files import write_atomically, write_json
+from saccade._internal.json import dumps
+from saccade.errors import InputError
+
+Record = TypeVar("Record")
+SETTINGS = "settings.json"
+
+
+class EpisodeFiles(Generic[Record]):
+    """Records of episodes, dataclasses of numbers and arrays, in ``DIR/episodes``.
+
+    Args:
+        folder: DIR.
+        kind: The dataclass.
+    """
+
+    def __init__(self, folder: Path, kind: type[Record]) -> None:
+        assert is_dataclass(kind)
+        self.folder = folder / "episodes"
+        self.kind = kind
+
+    def begin(self, settings: Mapping[str, Any]) -> None:
+        """Writes the settings of a run, or checks that the directory has results of the same settings.
+
+        Raises:
+            InputError: It has results of others; lists the settings that differ.
+            OSError: It cannot be written.
+        """
+        now = json.loads(dumps(settings))
+        file = self.folder / SETTINGS
+        if file.is_file():
+            before = self.settings()
+            names = [name for name in {**before, **now} if before.get(name) != now.get(name)]
+            if names:
+                raise InputError(
+                    f"{self.folder.parent}: has results with other settings ({', '.join(names)} changed): "
+                    "choose another directory, or delete this one"
+                )
+            return
+        self.folder.mkdir(parents=True, exist_ok=True)
+        write_json(file, now)
+
+    def settings(self) -> dict[str, Any]:
+        """The settings of the results.
+
+        Raises:
+            FileNotFoundError: There are no results.
+            InputError: The file is damaged.
+        """
+        file = self.folder / SETTINGS
+        if not file.is_file():
+            raise FileNotFoundError(f"{file}: no such file; expected the directory of an earlier run")
+        try:
+            found = json.loads(file.read_text(encoding="utf-8"))
+        except (OSError, ValueError, RecursionError) as error:
+            raise InputError(f"{file}: cannot be read as JSON: {error}") from None
+        if not isinstance(found, dict):
+            raise InputError(f"{file}: expected a JSON object, got {type(found).__name__}")
+        return found
+
+    def path(self, episode: int) -> Path:
+        """The file of an episode."""
+        return self.folder / f"{episode:06d}.npz"
+
+    def save(self, episode: int, record: Record) -> None:
+        """Writes the record of an episode."""
+        values = {field.name: getattr(record, field.name) for field in fields(record)}  # type: ignore[arg-type]
+        with write_atomically(self.path(episode)) as temporary:
+            np.savez(temporary, **values)
+
+    def load(self, episode: int) -> Record | None:
+        """The record of an episode, or None if there is none.
+
+        Raises:
+            InputError: The file is damaged.
+        """
+        path = self.path(episode)
+        if not path.is_file():
+            return None
+        try:
+            with np.load(path, allow_pickle=False) as arrays:
+                values = {name: arrays[name] for name in arrays.files}
+            return self.kind(
+                **{name: value.item() if not value.ndim else value for name, value in values.items()}
+            )
+        except (OSError, ValueError, TypeError, EOFError, zipfile.BadZipFile) as error:
+            raise InputError(f"{path}: cannot be read: {error}; delete it to compute it again") from None
+
+    def places(self) -> list[int]:
+        """The episodes that have a record."""
+        return sorted(int(path.stem) for path in self.folder.glob("[0-9]*.npz") if path.stem.isdecimal())

@@ -1,0 +1,106 @@
+"""How a process loads the policy and the recordings of a command, once."""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from saccade._internal.environment import show_config
+from saccade._internal.files import sha256_of
+from saccade._internal.hub import locate
+from saccade._internal.small_files import read_json
+from saccade.datasets import Dataset
+from saccade.datasets import open as open_recordings
+from saccade.policy.policy import Policy
+from saccade.robots.reading import processor_folder
+
+#: Files of a checkpoint that decide what it computes.
+WEIGHTS, COMPANIONS = ("*.safetensors",), ("*.json", "*.txt", "*/*.json", "*/*.safetensors")
+
+
+@dataclass(frozen=True)
+class Source:
+    """A checkpoint and recordings. It is pickled; each process loads them once.
+
+    Attributes:
+        checkpoint: Path of the checkpoint's directory.
+        recordings: Path or id of the data set.
+        options: Keyword arguments of :meth:`saccade.Policy.from_pretrained`, as JSON values.
+    """
+
+    checkpoint: str
+    recordings: str
+    options: Mapping[str, Any]
+
+    @classmethod
+    def of(cls, checkpoint: str | Path, recordings: str, options: Mapping[str, Any]) -> Source:
+        """The source of a checkpoint by its path or id, which is downloaded if need be."""
+        values = {name: str(value) if isinstance(value, Path) else value for name, value in options.items()}
+        return cls(str(locate(checkpoint).path), recordings, values)
+
+    @property
+    def policy(self) -> Policy:
+        """The policy; raises as :meth:`saccade.Policy.from_pretrained`."""
+        return _policy(self.checkpoint, json.dumps(self.options, sort_keys=True))
+
+    @property
+    def data(self) -> Dataset:
+        """The recordings, with the keys and steps of the policy; raises as :func:`saccade.datasets.open`."""
+        return _data(self.recordings, self.checkpoint, json.dumps(self.options, sort_keys=True))
+
+    def identity(self) -> dict[str, Any]:
+        """What decides the actions: hashes, options, and what computes."""
+        config = show_config("dicts")
+        return {
+            "checkpoint": {
+                "name": Path(self.checkpoint).resolve().name,
+                "sha256": weights_hash(self.checkpoint),
+            },
+            "recordings": {"name": Path(self.recordings).name, "sha256": self.data.fingerprint()},
+            "options": {name: value for name, value in self.options.items() if name != "num_threads"},
+            "saccade": config["saccade"],
+            "instruction_set": config["isa"],
+        }
+
+
+@functools.lru_cache(maxsize=1)
+def _policy(checkpoint: str, options: str) -> Policy:
+    return Policy.from_pretrained(checkpoint, **json.loads(options))
+
+
+@functools.lru_cache(maxsize=1)
+def _data(recordings: str, checkpoint: str, options: str) -> Dataset:
+    return open_recordings(recordings, data_config=_selection(_policy(checkpoint, options), Path(checkpoint)))
+
+
+def _selection(policy: Policy, checkpoint: Path) -> Any:
+    """What the policy takes of a data set: its data config, or its robot's modality configs; else None."""
+    if policy.normalizer.data_config is not None:
+        return policy.normalizer.data_config
+    file = processor_folder(checkpoint) / "processor_config.json"
+    if policy.normalizer.pipeline is not None or not file.is_file():
+        return None
+    robots = (read_json(file).get("processor_kwargs") or {}).get("modality_configs") or {}
+    return robots.get(str(policy.normalizer.embodiment))
+
+
+def weights_hash(checkpoint: str | Path) -> str:
+    """SHA-256 of the weights of a checkpoint, and of the files that decide how they are used.
+
+    The digest is that of lines with name and hash of each file.
+    """
+    folder = Path(checkpoint)
+    files = (
+        sorted(
+            {path for pattern in (*WEIGHTS, *COMPANIONS) for path in folder.glob(pattern) if path.is_file()}
+        )
+        if folder.is_dir()
+        else [folder]
+    )
+    lines = "".join(f"{path.relative_to(folder.parent).name} {sha256_of(path)}\n" for path in files)
+    return hashlib.sha256(lines.encode()).hexdigest()
