@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
+import json
 import pickle
+import types
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +13,9 @@ import numpy as np
 import pytest
 
 import saccade.datasets
+import saccade.observations
 from tests.helpers import dataset_cases as cases
+from tests.helpers.paths import DATA
 
 #: The modality configs of N1.7 with a history and chunks that reach beyond the end.
 CONFIGS: dict[str, Any] = {
@@ -163,3 +168,107 @@ def test_the_fingerprint_is_of_every_file(tmp_path: Path) -> None:
         assert data.fingerprint() not in seen
         seen.add(data.fingerprint())
     assert len(seen) == 1 + 4 + 3 + 6
+
+
+def test_the_keys_and_history_of_a_policy(tmp_path: Path) -> None:
+    data = saccade.datasets.open(cases.write_old(tmp_path))
+    config = {
+        "video_keys": ["video.wrist"],
+        "state_keys": ["state.hand", "state.arm"],
+        "action_keys": ["action.arm"],
+        "language_keys": ["annotation.human.task_description"],
+        "observation_indices": [-1, 0],
+        "action_indices": list(range(8)),
+        "state_modes": {},
+        "action_modes": {},
+        "target_rotations": {},
+    }
+    needs = saccade.observations.Requirements(
+        cameras=(saccade.observations.Camera("wrist"),),
+        state=(("hand", 1), ("arm", 3)),
+        state_history=2,
+        video_horizon=2,
+        language_keys=("annotation.human.task_description",),
+        any_annotation=True,
+        video_indices=(-1, 0),
+        state_indices=(-1, 0),
+        action_indices=tuple(range(8)),
+    )
+    policy = policy_like(needs, ["arm"])
+    chosen, expected = data.for_policy(policy), saccade.datasets.open(tmp_path, data_config=config)
+    found, wanted = chosen.observation(2, 5), expected.observation(2, 5)
+    assert found["language"] == wanted["language"]
+    for part in ("video", "state"):
+        assert list(found[part]) == list(wanted[part])
+        assert all(np.array_equal(found[part][key], wanted[part][key]) for key in found[part])
+    assert list(chosen.actions(2, 0)) == ["arm"]
+    assert chosen.actions(2, 0)["arm"].shape == (8, 3)
+    with pytest.raises(
+        saccade.InputError, match="data_config: expected one, because the checkpoint does not say"
+    ):
+        data.for_policy(policy_like(dataclasses.replace(needs, video_indices=None), ["arm"]))
+    with pytest.raises(
+        saccade.InputError, match=r"policy: state.leg, action.leg: not in .*modality.json, which has"
+    ):
+        data.for_policy(policy_like(dataclasses.replace(needs, state=(("leg", 1),)), ["leg"]))
+    # Policies of lerobot have the names of the data set.
+    plain = data.for_policy(policy_like(saccade.observations.Requirements(), [], pipeline=True))
+    assert (plain.cameras, plain.state_widths, plain.action_widths) == (
+        ("front", "wrist"),
+        {"state": 4},
+        {"action": 4},
+    )
+
+
+def policy_like(needs: saccade.observations.Requirements, actions: list[str], pipeline: Any = None) -> Any:
+    """What a data set looks at of a policy."""
+    groups = tuple(types.SimpleNamespace(key=key) for key in actions)
+    normalizer = types.SimpleNamespace(action_groups=groups, pipeline=pipeline)
+    return types.SimpleNamespace(requirements=needs, normalizer=normalizer)
+
+
+def test_keys_that_the_data_set_has_not(tmp_path: Path) -> None:
+    cases.write_old(tmp_path)
+    wrong = {**CONFIGS, "video": {"delta_indices": [0], "modality_keys": ["top"]}}
+    with pytest.raises(
+        saccade.InputError, match=r"data_config: video.top: not in .*modality.json, which has video.front"
+    ):
+        saccade.datasets.open(tmp_path, data_config=wrong)
+    parts: list[Any] = [{"modality_keys": ["front"]}, {"delta_indices": [], "modality_keys": []}, 3]
+    for part in parts:
+        with pytest.raises(
+            saccade.InputError, match="data_config: video: expected modality_keys and delta_indices"
+        ):
+            saccade.datasets.open(tmp_path, data_config={**CONFIGS, "video": part})
+    # Two annotations: which of them is the instruction?
+    data = saccade.datasets.open(tmp_path)
+    with pytest.raises(
+        saccade.InputError, match="data_config: expected one that says which is the instruction"
+    ):
+        data.instruction(0, 0)
+    for episode, step in ((3, 0), (-1, 0), (0, 7), (0, -1), (0, 1.5), ("0", 0)):
+        with pytest.raises(saccade.InputError, match=r"^(episode|step): expected"):
+            data.frame(episode, step, "front")  # type: ignore[arg-type]
+    with pytest.raises(saccade.InputError, match="camera: expected one of front, wrist, got 'top'"):
+        data.frame(0, 0, "top")
+    with pytest.raises(saccade.InputError, match=r"name: expected a column, one of observation.state"):
+        data.column(0, "observation.images.front")
+
+
+@pytest.mark.parametrize("name", sorted(path.name for path in (DATA / "datasets").iterdir()))
+def test_published_metadata(name: str, tmp_path: Path) -> None:
+    """The keys of NVIDIA's demo data are those of its modality.json; the numbers follow from info.json."""
+    from saccade.datasets.metadata import Info
+    from saccade.datasets.modality import read_modality
+
+    info = json.loads((DATA / "datasets" / name / "info.json").read_text())
+    modality = json.loads((DATA / "datasets" / name / "modality.json").read_text())
+    known = Info(tmp_path, info)
+    found = read_modality(modality, known.features, "modality.json")
+    for kind in ("state", "action"):
+        keys = getattr(found, kind)
+        assert list(keys) == list(modality[kind])
+        column = known.features["observation.state" if kind == "state" else "action"]
+        assert sum(one.width for one in keys.values()) == column.shape[0]
+    assert [known.features[key].dtype for key in found.video.values()] == ["video"] * len(modality["video"])
+    assert list(found.language)[1:] == [f"annotation.{key}" for key in modality["annotation"]]

@@ -18,11 +18,12 @@ from saccade._internal.extras import SACCADE
 from saccade._internal.files import sha256_of
 from saccade.datasets import forms
 from saccade.datasets.features import Episode, Metadata
-from saccade.datasets.modality import ANNOTATION, Columns, Modality, plain
+from saccade.datasets.modality import ANNOTATION, TASK, Columns, Modality, plain
 from saccade.datasets.parquet import Steps, read_steps
-from saccade.datasets.selection import Part, Selection
+from saccade.datasets.selection import Part, Selection, selection_of
 from saccade.datasets.videos import TOLERANCE, Frame, Videos
 from saccade.errors import DatasetError, InputError
+from saccade.observations.pictures import ObservingPolicy
 
 #: The largest number that float32 can hold.
 LARGEST = float(np.finfo(np.float32).max)
@@ -105,6 +106,25 @@ class Dataset:
             f"Dataset({str(self.root)!r}, {self.version}: {len(self)} episodes, "
             f"{sum(one.length for one in self.episodes)} steps at {self.fps:g} Hz, {len(self.tasks)} tasks)"
         )
+
+    def for_policy(self, policy: ObservingPolicy) -> Dataset:
+        """The data set with the keys and the history that a policy takes.
+
+        For a policy of lerobot these are the names of the data set, and the keys ``state`` and ``action``.
+
+        Raises:
+            InputError: The data set has not the policy's keys, or the checkpoint does not say at which steps
+                its history is: then open the data set with a data config.
+
+        Example:
+            >>> import saccade
+            >>> def first_chunk(policy: saccade.Policy, data: Dataset) -> dict:
+            ...     return policy.act(data.for_policy(policy).observation(0, 0), seed=0)
+        """
+        keys = self._modality
+        if policy.normalizer.pipeline is not None:
+            keys = plain(self._metadata.features, keys.where)
+        return self._with(keys, selection_of(policy, keys))
 
     def observation(self, episode: int, step: int, form: str = "isaac") -> dict[str, Any]:
         """The observation at a step, as :meth:`saccade.Policy.act` takes it, with a batch axis of one.
@@ -196,7 +216,9 @@ class Dataset:
         """
         if self._selection.language is not None:
             return self._selection.language
-        keys = [key for key in self._modality.language if key.startswith(ANNOTATION)] or ["task"]
+        there = {TASK, *self._metadata.features}
+        known = [key for key, column in self._modality.language.items() if column in there]
+        keys = [key for key in known if key.startswith(ANNOTATION)] or ["task"]
         if len(keys) > 1:
             raise InputError(
                 f"data_config: expected one that says which is the instruction, because "

@@ -8,6 +8,8 @@ from typing import Any, TypeAlias
 
 from saccade.datasets.modality import Modality
 from saccade.errors import InputError
+from saccade.observations import Camera
+from saccade.observations.pictures import ObservingPolicy
 from saccade.robots import DataConfigLike
 from saccade.robots.data_configs import data_config
 
@@ -65,6 +67,12 @@ def read_selection(given: SelectionLike | None, modality: Modality) -> Selection
             Part(config.keys("action"), config.action_indices),
             config.language_keys[0] if config.language_keys else None,
         )
+    _check(found, modality, "data_config")
+    return found
+
+
+def _check(found: Selection, modality: Modality, argument: str) -> None:
+    """Checks that the keys are in the data set."""
     missing = [
         f"{kind}.{key}"
         for kind, there in (("video", modality.video), ("state", modality.state), ("action", modality.action))
@@ -76,10 +84,9 @@ def read_selection(given: SelectionLike | None, modality: Modality) -> Selection
     if missing:
         names = [f"{kind}.{key}" for kind in KINDS[:3] for key in getattr(modality, kind)]
         raise InputError(
-            f"data_config: {', '.join(missing)}: not in {modality.where}, which has "
+            f"{argument}: {', '.join(missing)}: not in {modality.where}, which has "
             f"{', '.join([*names, *modality.language])}"
         )
-    return found
 
 
 def _from_configs(given: Mapping[str, Any]) -> Selection:
@@ -100,6 +107,56 @@ def _from_configs(given: Mapping[str, Any]) -> Selection:
             "data_config: language: expected one key and the step 0, as the released loader does"
         )
     return Selection(parts["video"], parts["state"], parts["action"], next(iter(language.keys), None))
+
+
+def selection_of(policy: ObservingPolicy, modality: Modality) -> Selection:
+    """The keys and steps of a policy.
+
+    Raises:
+        InputError: The data set has not the policy's keys, or the checkpoint does not say at which steps its
+            history is.
+    """
+    needs, normalizer = policy.requirements, policy.normalizer
+    if normalizer.pipeline is not None:  # lerobot's policies have the names of the data set
+        cameras, states, actions = (tuple(keys) for keys in (modality.video, modality.state, modality.action))
+    else:
+        cameras = tuple(modality.video)
+        if needs.cameras is not None and not needs.takes_extra_cameras:
+            cameras = tuple(_camera(camera, modality) for camera in needs.cameras)
+        states = tuple(key for key, _ in needs.state)
+        actions = tuple(group.key for group in normalizer.action_groups)
+    language = needs.language_key
+    if len(needs.language_keys) > 1:
+        raise InputError(f"policy: expected one language key, got {', '.join(needs.language_keys)}")
+    if needs.any_annotation and language not in modality.language:
+        language = None
+    found = Selection(
+        Part(cameras, _steps("frames", needs.video_indices, needs.video_horizon)),
+        Part(states, _steps("states", needs.state_indices, needs.state_history)),
+        Part(actions, needs.action_indices),
+        language,
+    )
+    _check(found, modality, "policy")
+    return found
+
+
+def _camera(camera: Camera, modality: Modality) -> str:
+    """The name that a data set has for a camera of a policy."""
+    if camera.alias is not None and camera.alias in modality.video and camera.name not in modality.video:
+        return camera.alias
+    return camera.name
+
+
+def _steps(what: str, indices: tuple[int, ...] | None, count: int | None) -> tuple[int, ...]:
+    """The steps of a history, which are known if there is none."""
+    if indices is not None:
+        return indices
+    if count not in (None, 1):
+        raise InputError(
+            f"data_config: expected one, because the checkpoint does not say at which steps the "
+            f"{count} {what} of an observation are"
+        )
+    return (0,)
 
 
 def _all(values: Any, kind: type) -> bool:

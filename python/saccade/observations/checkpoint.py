@@ -114,6 +114,8 @@ def _processor(folder: Path, values: Mapping[str, Any], robot: Robot) -> Require
     return Requirements(
         cameras=tuple(Camera(name) for name in cameras) or None,
         video_horizon=len(steps) or None,
+        video_indices=_steps(about.get("video")),
+        state_indices=_steps(about.get("state")),
         language_keys=tuple(keys),
         requires_language=True,
     )
@@ -136,9 +138,18 @@ def _metadata(folder: Path, values: Mapping[str, Any], robot: Robot) -> Requirem
         video_horizon=len(data_config.observation_indices),
         language_keys=data_config.language_keys,
         any_annotation=True,
+        video_indices=data_config.observation_indices,
+        state_indices=data_config.observation_indices,
         observation_indices=data_config.observation_indices,
         action_indices=data_config.action_indices,
     )
+
+
+def _steps(config: Any) -> tuple[int, ...] | None:
+    """The ``delta_indices`` of a modality, if they are integers."""
+    steps = (config or {}).get("delta_indices")
+    is_known = isinstance(steps, list) and steps and all(type(step) is int for step in steps)
+    return tuple(steps) if is_known else None
 
 
 def _names(given: Any) -> list[str]:

@@ -47,6 +47,8 @@ class Requirements:
         takes_extra_cameras: Whether cameras beyond ``cameras`` are views too. All are then sorted by name, as
             in lerobot. Otherwise they are ignored.
         rename_map: Keys of lerobot's format and the names that they get before anything else is read.
+        video_indices, state_indices: The steps of the frames and states of an observation, relative to now;
+            None if the checkpoint does not say.
         observation_indices, action_indices: The steps of observations and actions, which a server reports to
             its clients.
     """
@@ -61,6 +63,8 @@ class Requirements:
     any_annotation: bool = False
     takes_extra_cameras: bool = False
     rename_map: tuple[tuple[str, str], ...] = ()
+    video_indices: tuple[int, ...] | None = None
+    state_indices: tuple[int, ...] | None = None
     observation_indices: tuple[int, ...] | None = None
     action_indices: tuple[int, ...] | None = None
 
