@@ -2,6 +2,7 @@
 
 use saccade_vla_kernels::{AlignedVec, Rows, RowsMut};
 
+use crate::array;
 use crate::error::{Error, Result};
 use crate::ops::{check_interrupted, refused};
 
@@ -17,13 +18,22 @@ pub(crate) fn reserve<T>(what: &'static str, buffer: &mut Vec<T>, len: usize) ->
     })
 }
 
+/// An empty vector with room for `len` elements.
+///
+/// # Errors
+/// [`Error::Memory`] if the system refuses it.
+pub(crate) fn reserved<T>(what: &'static str, len: usize) -> Result<Vec<T>> {
+    let mut buffer = Vec::new();
+    reserve(what, &mut buffer, len)?;
+    Ok(buffer)
+}
+
 /// `len` times `value`.
 ///
 /// # Errors
 /// [`Error::Memory`] if the system refuses it, [`Error::Interrupted`].
 pub(crate) fn filled<T: Clone>(what: &'static str, len: usize, value: T) -> Result<Vec<T>> {
-    let mut buffer = Vec::new();
-    reserve(what, &mut buffer, len)?;
+    let mut buffer = reserved(what, len)?;
     in_stretches(0, len, |len| buffer.resize(len, value.clone()))?;
     Ok(buffer)
 }
@@ -55,8 +65,7 @@ pub(crate) fn collected<T>(
     len: usize,
     values: impl IntoIterator<Item = T>,
 ) -> Result<Vec<T>> {
-    let mut buffer = Vec::new();
-    reserve(what, &mut buffer, len)?;
+    let mut buffer = reserved(what, len)?;
     buffer.extend(values);
     Ok(buffer)
 }
@@ -66,8 +75,7 @@ pub(crate) fn collected<T>(
 /// # Errors
 /// [`Error::Memory`] if the system refuses it.
 pub(crate) fn copied(what: &'static str, rows: Rows<'_>) -> Result<Vec<f32>> {
-    let mut buffer = Vec::new();
-    reserve(what, &mut buffer, rows.num_rows() * rows.num_columns())?;
+    let mut buffer = reserved(what, rows.num_rows() * rows.num_columns())?;
     rows.iter().for_each(|row| buffer.extend_from_slice(row));
     Ok(buffer)
 }
@@ -135,10 +143,7 @@ impl Scratch {
 /// # Errors
 /// [`Error::Memory`] if it is beyond what can be addressed.
 pub(crate) fn product(what: &'static str, sizes: &[usize]) -> Result<usize> {
-    let product = sizes
-        .iter()
-        .try_fold(1_usize, |product, &size| product.checked_mul(size));
-    product.ok_or(Error::Memory {
+    array::product(sizes).ok_or(Error::Memory {
         what,
         bytes: usize::MAX,
     })

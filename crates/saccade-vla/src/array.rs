@@ -28,7 +28,7 @@ impl<'a, T> Array<'a, T> {
     /// # Errors
     /// [`Error::Shape`] if the sizes in `shape` do not multiply to the length of `data`.
     pub fn new(data: &'a [T], shape: &'a [usize]) -> Result<Self> {
-        check_length(data.len(), shape)?;
+        check_length("shape", data.len(), shape)?;
         Ok(Self {
             data,
             shape,
@@ -83,11 +83,7 @@ impl<'a> Array<'a> {
     pub(crate) fn check_result(self, name: &str) -> Result<Self> {
         match first_not_finite(self.data) {
             None => Ok(self),
-            Some(position) => Err(Error::Input(problem!(
-                name;
-                "the result is not finite, {} at index {}: inputs or weights are too large for the arithmetic",
-                self.data[position], show_shape(&unravel(position, self.shape))
-            ))),
+            Some(position) => Err(not_finite(name, self.data[position], position, self.shape)),
         }
     }
 }
@@ -112,7 +108,7 @@ impl<'a, T> ArrayMut<'a, T> {
     /// # Errors
     /// [`Error::Shape`] if the sizes in `shape` do not multiply to the length of `data`.
     pub fn new(data: &'a mut [T], shape: &'a [usize]) -> Result<Self> {
-        check_length(data.len(), shape)?;
+        check_length("shape", data.len(), shape)?;
         Ok(Self { data, shape })
     }
 
@@ -153,7 +149,7 @@ impl<T> OwnedArray<T> {
     /// # Errors
     /// [`Error::Shape`] if the sizes in `shape` do not multiply to the length of `data`.
     pub fn new(data: Vec<T>, shape: &[usize]) -> Result<Self> {
-        check_length(data.len(), shape)?;
+        check_length("shape", data.len(), shape)?;
         Ok(Self {
             data,
             shape: shape.to_vec(),
@@ -202,16 +198,20 @@ impl OwnedArray {
     }
 }
 
-fn check_length(len: usize, shape: &[usize]) -> Result<()> {
-    let elements = shape
-        .iter()
-        .try_fold(1_usize, |elements, &size| elements.checked_mul(size));
-    if elements == Some(len) {
-        return Ok(());
+/// Checks that the sizes in `shape` multiply to `len`.
+pub(crate) fn check_length(name: &str, len: usize, shape: &[usize]) -> Result<()> {
+    match product(shape) {
+        Some(elements) if elements == len => Ok(()),
+        _ => Err(Error::Shape(problem!(
+            name; "{} does not fit {len} elements", show_shape(shape)
+        ))),
     }
-    Err(Error::Shape(problem!(
-        "shape"; "{} does not fit {len} elements", show_shape(shape)
-    )))
+}
+
+/// The product of sizes; none if it is beyond what can be addressed.
+pub(crate) fn product(sizes: &[usize]) -> Option<usize> {
+    let mut sizes = sizes.iter();
+    sizes.try_fold(1_usize, |product, &size| product.checked_mul(size))
 }
 
 fn check_shape(name: &str, axes: &str, given: &[usize], expected: &[usize]) -> Result<()> {
@@ -221,6 +221,14 @@ fn check_shape(name: &str, axes: &str, given: &[usize], expected: &[usize]) -> R
     Err(Error::Shape(problem!(
         name; expected "{axes} = {}", show_shape(expected); got "{}", show_shape(given)
     )))
+}
+
+/// The error for an element of a result of this shape that is not finite.
+pub(crate) fn not_finite(name: &str, value: f32, position: usize, shape: &[usize]) -> Error {
+    Error::Input(problem!(
+        name; "the result is not finite, {value} at index {}: inputs or weights are too large for the arithmetic",
+        show_shape(&unravel(position, shape))
+    ))
 }
 
 /// The position of the first NaN or infinity.

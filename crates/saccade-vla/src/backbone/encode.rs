@@ -11,7 +11,7 @@ use super::model::{Backbone, BackboneWorkspace};
 use super::qwen3::{Additions, NewRows};
 use super::reuse::{longest_prefix, same_view};
 use super::token_positions::{rope_pairs, token_positions};
-use crate::alloc::{collected, filled, product, reserve};
+use crate::alloc::{collected, filled, product, reserve, reserved};
 use crate::array::{Array, OwnedArray};
 use crate::engine::Kernels;
 use crate::error::{Error, Result, problem};
@@ -148,8 +148,7 @@ impl Backbone {
         reserve("views", &mut new, count)?;
         let mut number = 0;
         for inputs in inputs {
-            let mut of_inputs = Vec::new();
-            reserve("views", &mut of_inputs, inputs.views.len())?;
+            let mut of_inputs = reserved("views", inputs.views.len())?;
             for prompt in &inputs.prompts {
                 for (place, view) in inputs.views[prompt.views.clone()].iter().enumerate() {
                     let same = same_view(previous, (number, place), view);
@@ -222,11 +221,9 @@ impl Backbone {
                     .push(OwnedArray::new(filled("record", len, 0.0)?, &shape)?);
             }
         }
-        let mut prompts = Vec::new();
-        reserve("prompts", &mut prompts, inputs.prompts.len())?;
         Ok(BackboneFeatures {
             backbone: self.id,
-            prompts,
+            prompts: reserved("prompts", inputs.prompts.len())?,
             num_tokens: inputs.num_tokens,
             feature_dim: self.config.feature_dim(),
             recorded,
@@ -242,8 +239,7 @@ impl Backbone {
     ) -> Result<Vec<Arc<EncodedPrompt>>> {
         let rows: usize = group.iter().map(Sequence::num_rows).sum();
         let mut caches: Vec<Vec<PackedKeyValues>> = Vec::new();
-        let mut positions = Vec::new();
-        reserve("positions", &mut positions, rows)?;
+        let mut positions = reserved("positions", rows)?;
         for sequence in group {
             positions.extend_from_slice(&sequence.positions[sequence.first()..]);
             caches.push(match sequence.num_rows() {
@@ -379,8 +375,7 @@ fn encoded_prompt(
         ..
     } = sequence.prompt;
     let dim = new.num_columns();
-    let mut features = Vec::new();
-    reserve("backbone_features", &mut features, ids.len() * dim)?;
+    let mut features = reserved("backbone_features", ids.len() * dim)?;
     if let Some((held, len)) = sequence.known {
         features.extend_from_slice(&held.features[..len * dim]);
     }

@@ -3,7 +3,7 @@
 use std::borrow::Cow;
 
 use super::features::BackboneFeatures;
-use crate::alloc::{filled, product, reserve};
+use crate::alloc::{filled, product, reserved};
 use crate::array::{Array, OwnedArray};
 use crate::error::{Error, Problem, Result};
 use crate::head::encode::Features;
@@ -69,8 +69,7 @@ impl<'a> FeatureBatch<'a> {
         let features = match *all {
             [one] if count == 1 => Cow::Borrowed(one.features(0)),
             _ => {
-                let mut joined = Vec::new();
-                reserve(WHAT, &mut joined, product(WHAT, &shape)?)?;
+                let mut joined = reserved(WHAT, product(WHAT, &shape)?)?;
                 for (row, (features, prompt)) in prompts().enumerate() {
                     joined.extend_from_slice(features.features(prompt));
                     joined.resize((row + 1) * longest * width, 0.0);

@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use saccade_vla_kernels::PackedKeyValues;
 
-use crate::alloc::{filled, product, reserve};
+use crate::alloc::{filled, product, reserve, reserved};
 use crate::array::OwnedArray;
 use crate::error::Result;
 
@@ -116,8 +116,7 @@ impl BackboneFeatures {
     pub fn masks(&self) -> Result<(OwnedArray<bool>, OwnedArray<bool>)> {
         let shape = [self.batch(), self.num_tokens];
         let len = product("masks", &shape)?;
-        let mut attended = Vec::new();
-        reserve("masks", &mut attended, len)?;
+        let mut attended = reserved("masks", len)?;
         let mut image = filled("masks", len, false)?;
         for (prompt, image) in self.prompts.iter().zip(image.chunks_exact_mut(self.num_tokens)) {
             attended.extend_from_slice(&prompt.attended);

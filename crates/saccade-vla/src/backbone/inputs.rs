@@ -3,7 +3,7 @@
 use std::ops::Range;
 
 use super::config::{BackboneConfig, CHANNELS, Tower, VisionConfig};
-use crate::alloc::{collected, filled, reserve};
+use crate::alloc::{collected, filled, reserve, reserved};
 use crate::array::{Array, unravel};
 use crate::error::{Error, Result, problem, show_shape};
 
@@ -89,8 +89,7 @@ impl<'a> Checked<'a> {
         }
         check_ids(config, &inputs.input_ids)?;
         let views = views(config, inputs)?;
-        let mut prompts = Vec::new();
-        reserve("prompts", &mut prompts, batch)?;
+        let mut prompts = reserved("prompts", batch)?;
         let mut first = 0;
         for row in 0..batch {
             let tokens = row * num_tokens..(row + 1) * num_tokens;
@@ -272,8 +271,7 @@ fn patches<'a>(
             "pixel_values"; expected "(patches, {patch_elements})"; got "{}", show_shape(array.shape())
         )));
     }
-    let mut views = Vec::new();
-    reserve("views", &mut views, grid.shape()[0])?;
+    let mut views = reserved("views", grid.shape()[0])?;
     let mut left = array.data();
     for (index, sizes) in grid.data().chunks_exact(3).enumerate() {
         let side = |side: i64| {

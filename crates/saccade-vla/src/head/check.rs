@@ -113,19 +113,11 @@ impl ActionHead {
         batch: usize,
         checked: &mut Vec<usize>,
     ) -> Result<()> {
-        checked.clear();
-        reserve("embodiment_id", checked, batch)?;
-        if !ids.shape().is_empty() {
-            ids.check_shape("embodiment_id", "(batch,)", &[batch])?;
-        }
-        for &id in ids.data() {
-            let loaded = usize::try_from(id)
-                .ok()
-                .filter(|id| self.embodiment_ids.contains(id));
-            checked.push(loaded.ok_or_else(|| self.embodiment_error(id))?);
-        }
-        checked.resize(batch, checked[0]);
-        Ok(())
+        for_batch("embodiment_id", ids, batch, checked, |id| {
+            let loaded = usize::try_from(id).ok();
+            let loaded = loaded.filter(|id| self.embodiment_ids.contains(id));
+            loaded.ok_or_else(|| self.embodiment_error(id))
+        })
     }
 
     fn embodiment_error(&self, id: i64) -> Error {
@@ -151,19 +143,34 @@ impl ActionHead {
     }
 
     pub(super) fn check_timestep(&self, timestep: Array<'_, i64>, batch: usize) -> Result<Vec<usize>> {
-        if !timestep.shape().is_empty() {
-            timestep.check_shape("timestep", "(batch,)", &[batch])?;
-        }
         let last = self.config.num_timestep_buckets - 1;
         let mut timesteps = Vec::new();
-        reserve("timestep", &mut timesteps, batch)?;
-        for &given in timestep.data() {
+        for_batch("timestep", timestep, batch, &mut timesteps, |given| {
             let timestep = usize::try_from(given).ok().filter(|timestep| *timestep <= last);
-            timesteps.push(timestep.ok_or_else(|| {
+            timestep.ok_or_else(|| {
                 Error::Input(problem!("timestep"; expected "a bucket from 0 to {last}"; got "{given}"))
-            })?);
-        }
-        timesteps.resize(batch, timesteps[0]);
+            })
+        })?;
         Ok(timesteps)
     }
+}
+
+/// The `given` scalar or `(batch,)`, each checked by `check`, for each observation of a batch.
+fn for_batch(
+    name: &'static str,
+    given: Array<'_, i64>,
+    batch: usize,
+    checked: &mut Vec<usize>,
+    check: impl Fn(i64) -> Result<usize>,
+) -> Result<()> {
+    checked.clear();
+    reserve(name, checked, batch)?;
+    if !given.shape().is_empty() {
+        given.check_shape(name, "(batch,)", &[batch])?;
+    }
+    for &given in given.data() {
+        checked.push(check(given)?);
+    }
+    checked.resize(batch, checked[0]);
+    Ok(())
 }

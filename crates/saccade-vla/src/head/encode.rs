@@ -6,7 +6,7 @@ use super::action_head::ActionHead;
 use super::context::{Context, Seen};
 use super::vl_encoder::VlTokens;
 use super::workspace::Workspace;
-use crate::alloc::{collected, reserve};
+use crate::alloc::{collected, reserved};
 use crate::array::Array;
 use crate::config::Reads;
 use crate::engine::Kernels;
@@ -215,8 +215,7 @@ impl ActionHead {
 
 /// By observation, the positions whose tokens are seen.
 fn positions(batch: usize, num_vl_tokens: usize, is_seen: impl Fn(usize) -> bool) -> Result<Vec<Vec<usize>>> {
-    let mut all = Vec::new();
-    reserve("masks", &mut all, batch)?;
+    let mut all = reserved("masks", batch)?;
     for element in 0..batch {
         let tokens = element * num_vl_tokens..(element + 1) * num_vl_tokens;
         let count = tokens.clone().filter(|&token| is_seen(token)).count();

@@ -11,9 +11,9 @@ use super::action_head::ActionHead;
 use super::dit::{ActiveRows, Pass};
 use super::workspace::Workspace;
 use crate::alloc::reserve;
-use crate::array::unravel;
+use crate::array::not_finite;
 use crate::engine::Kernels;
-use crate::error::{Error, Result, problem, show_shape};
+use crate::error::Result;
 use crate::inspect::trace::{Recorded, StepBlock};
 use crate::ops::check_interrupted;
 use crate::sampling::chunking::Seam;
@@ -227,11 +227,8 @@ impl ActionHead {
         let actions = x.columns(0..self.config.action_dim);
         for (row, action) in actions.iter().enumerate() {
             if let Some(column) = action.iter().position(|value| !value.is_finite()) {
-                return Err(Error::Input(problem!(
-                    "actions";
-                    "the result is not finite, {} at index {}: inputs or weights are too large for the arithmetic",
-                    action[column], show_shape(&unravel(row * x.num_columns() + column, shape))
-                )));
+                let position = row * x.num_columns() + column;
+                return Err(not_finite("actions", action[column], position, shape));
             }
         }
         RowsMut::new(out, self.config.action_dim).copy_from(actions);

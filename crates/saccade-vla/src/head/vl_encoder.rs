@@ -8,7 +8,7 @@ use std::ops::Range;
 use saccade_vla_kernels::{Epilogue, PackedKeyValues, Rows, RowsMut};
 
 use super::context::Seen;
-use crate::alloc::{Scratch, collected, filled};
+use crate::alloc::{Scratch, filled, reserved};
 use crate::config::{HeadConfig, Reads};
 use crate::engine::Kernels;
 use crate::error::Result;
@@ -150,7 +150,7 @@ impl VlEncoder {
         let mut caches = Vec::new();
         for block in tokens.cross {
             let held = if block.is_some() { batch } else { 0 };
-            caches.push(collected("keys and values", held, [])?);
+            caches.push(reserved("keys and values", held)?);
         }
         let together = (ENCODE_ROWS / num_vl_tokens).max(1);
         for first in (0..batch).step_by(together) {

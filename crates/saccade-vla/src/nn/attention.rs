@@ -9,7 +9,7 @@ use super::kv_cache;
 use super::linear::Linear;
 use super::sequences::Sequences;
 use super::weights::Weights;
-use crate::alloc::{Scratch, collected, product, reserve};
+use crate::alloc::{Scratch, product, reserve, reserved};
 use crate::engine::{Engine, Kernels};
 use crate::error::Result;
 use crate::precision::Role;
@@ -169,7 +169,7 @@ impl Attention {
     ) -> Result<Vec<PackedKeyValues>> {
         let (keys, values) = self.keys_values(kernels, source, kv)?;
         let mut first = 0;
-        let mut caches = collected("keys and values", counts.len(), [])?;
+        let mut caches = reserved("keys and values", counts.len())?;
         for &count in counts {
             let mut cache = self.empty_cache(kernels.engine);
             let own = first..first + count;

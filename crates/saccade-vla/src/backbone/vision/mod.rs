@@ -19,7 +19,7 @@ pub(super) use self::tower::VisionWorkspace;
 use super::config::{BackboneConfig, Tower};
 use super::features::View;
 use super::inputs::{ViewPixels, num_tokens};
-use crate::alloc::{collected, copied, reserve};
+use crate::alloc::{collected, copied, reserved};
 use crate::engine::Kernels;
 use crate::error::Result;
 use crate::nn::weights::Weights;
@@ -63,8 +63,7 @@ impl Vision {
         workspace: &mut VisionWorkspace,
     ) -> Result<Vec<Arc<View>>> {
         let width = config.language.width;
-        let mut encoded = Vec::new();
-        reserve("views", &mut encoded, views.len())?;
+        let mut encoded = reserved("views", views.len())?;
         let mut left = views;
         while !left.is_empty() {
             let mut rows = 0;

@@ -4,7 +4,7 @@
 
 use saccade_vla_kernels::Rows;
 
-use crate::alloc::reserve;
+use crate::alloc::reserved;
 use crate::backbone::config::VisionConfig;
 use crate::error::Result;
 use crate::nn::rope::{RopePair, frequencies};
@@ -77,8 +77,7 @@ pub(super) fn vision_rope_pairs(config: &VisionConfig) -> Vec<RopePair> {
 /// The row and column of each patch of a view whose patches come in squares of `merge` on each side, square
 /// by square.
 pub(super) fn patch_places(merge: usize, [rows, columns]: [usize; 2]) -> Result<Vec<[usize; 2]>> {
-    let mut places = Vec::new();
-    reserve("positions", &mut places, rows * columns)?;
+    let mut places = reserved("positions", rows * columns)?;
     for row in (0..rows).step_by(merge) {
         for column in (0..columns).step_by(merge) {
             for inside in 0..merge * merge {

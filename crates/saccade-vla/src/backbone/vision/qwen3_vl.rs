@@ -6,7 +6,7 @@ use super::block::{BlockNames, VisionBlock};
 use super::connector::{Connector, ConnectorNames, ConnectorSizes};
 use super::positions::{Taps, evenly_spaced, interpolate, patch_places, vision_rope_pairs};
 use super::tower::{TokensWorkspace, VisionTower};
-use crate::alloc::{Scratch, reserve};
+use crate::alloc::{Scratch, reserved};
 use crate::array::OwnedArray;
 use crate::backbone::config::{BackboneConfig, CHANNELS, Tower, VisionConfig};
 use crate::backbone::inputs::ViewPixels;
@@ -100,8 +100,7 @@ impl VisionTower for Qwen3Vl {
     ) -> Result<Option<Rope>> {
         let (side, elements) = (self.config.table_side(), self.patch_embed.in_features());
         let mut patch_vectors = patch_vectors.rows(x.num_rows(), elements)?;
-        let mut places = Vec::new();
-        reserve("positions", &mut places, x.num_rows())?;
+        let mut places = reserved("positions", x.num_rows())?;
         let mut rows = x.iter_mut();
         for view in views {
             check_interrupted()?;

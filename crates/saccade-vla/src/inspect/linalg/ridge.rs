@@ -4,7 +4,7 @@ use faer::MatRef;
 
 use super::matrix::{MATRIX, Matrix, check_columns, check_result, check_rows, times};
 use super::svd::Svd;
-use crate::alloc::{collected, filled, product};
+use crate::alloc::{filled, product, reserved};
 use crate::array::{Array, OwnedArray};
 use crate::error::{Error, Result, problem};
 use crate::ops::check_interrupted;
@@ -111,7 +111,7 @@ impl Ridge {
         };
         check_columns(&x, features)?;
         let len = product(MATRIX, &[penalties, x.rows(), targets])?;
-        let mut predicted = collected(MATRIX, len, [])?;
+        let mut predicted = reserved(MATRIX, len)?;
         let each = self.weights.data().chunks_exact(features * targets);
         for (weights, intercept) in each.zip(self.intercepts.data().chunks_exact(targets)) {
             let weights = MatRef::from_row_major_slice(weights, features, targets);

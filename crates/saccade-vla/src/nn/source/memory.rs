@@ -10,6 +10,7 @@ use safetensors::Dtype;
 
 use super::{Request, Source, Tensor};
 use crate::alloc::reserve;
+use crate::array::check_length;
 use crate::error::{Error, Problem, Result, problem, show_shape};
 use crate::ops::check_interrupted;
 use saccade_vla_checkpoint::spec::{self, TensorProblem};
@@ -98,14 +99,7 @@ impl<'a> TensorView<'a> {
     /// # Errors
     /// [`Error::Shape`] if there are more or fewer than the shape says.
     pub fn new(shape: &[usize], elements: ElementsRef<'a>) -> Result<Self> {
-        let expected = shape
-            .iter()
-            .try_fold(1_usize, |count, &size| count.checked_mul(size));
-        if expected != Some(elements.len()) {
-            return Err(Error::Shape(problem!(
-                "tensors"; "{} does not fit {} elements", show_shape(shape), elements.len()
-            )));
-        }
+        check_length("tensors", elements.len(), shape)?;
         Ok(Self {
             shape: shape.to_vec(),
             elements,
