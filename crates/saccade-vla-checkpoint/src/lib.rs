@@ -29,6 +29,8 @@ pub use ahead::{ReadAhead, Wanted};
 pub use companions::{Companions, OWN_CONFIG};
 pub use elements::Elements;
 pub use error::{Error, Problem, Result, printable, probe_allocation, reserve, show_bytes, show_shape};
+/// The type of the elements of [`Elements::Bf16`].
+pub use half::bf16;
 pub use names::plain_name;
 pub use reader::Checkpoint;
 /// The types that tensors are stored in.
