@@ -150,6 +150,23 @@ def test_a_data_set_without_modality_has_lerobots_names(tmp_path: Path) -> None:
     assert data.instruction(1, 0) == cases.TASKS[1]
 
 
+def test_statistics_are_those_of_all_steps(root: Path) -> None:
+    data = saccade.datasets.open(root)
+    recorded = [cases.columns(episode, length, 0) for episode, length in enumerate(cases.LENGTHS)]
+    if data.version == "v3.0":  # no stats.json
+        assert data.statistics == {"state": {}, "action": {}}
+        return
+    for kind, key, column, numbers in (
+        ("state", "hand", "observation.state", slice(3, 4)),
+        ("action", "base", "action.base", slice(1, 2)),
+    ):
+        rows = np.concatenate([one[column] for one in recorded]).astype(np.float64)[:, numbers]
+        found = data.statistics[kind][key]
+        assert list(found) == ["min", "max", "mean", "std"]
+        for name, values in found.items():
+            np.testing.assert_allclose(values, getattr(np, name)(rows, axis=0), rtol=1e-12)
+
+
 def test_a_copy_reads_the_same(root: Path) -> None:
     data = saccade.datasets.open(root)
     before = data.frame(0, 3, "front").pixels
@@ -167,7 +184,7 @@ def test_the_fingerprint_is_of_every_file(tmp_path: Path) -> None:
         path.write_bytes(path.read_bytes() + b"\n")
         assert data.fingerprint() not in seen
         seen.add(data.fingerprint())
-    assert len(seen) == 1 + 4 + 3 + 6
+    assert len(seen) == 1 + 5 + 3 + 6
 
 
 def test_the_keys_and_history_of_a_policy(tmp_path: Path) -> None:

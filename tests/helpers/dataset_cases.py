@@ -135,6 +135,28 @@ def write_lines(path: Path, rows: Sequence[Any]) -> None:
     path.write_text("".join(json.dumps(row) + "\n" for row in rows))
 
 
+def statistics(values: npt.NDArray[Any]) -> dict[str, list[float]]:
+    """The statistics of a column, or of frames by colour, as lerobot writes them."""
+    rows = values.astype(np.float64)
+    axes: tuple[int, ...] = (0,)
+    if values.ndim == 4:
+        rows, axes = np.moveaxis(rows, -1, 1) / 255, (0, 2, 3)
+    found = {
+        name: getattr(np, name)(rows, axis=axes, keepdims=True)[0].tolist()
+        for name in ("min", "max", "mean", "std")
+    }
+    found = {name: value if isinstance(value, list) else [value] for name, value in found.items()}
+    return {**found, "count": [len(values)]}
+
+
+def all_statistics(episode: int, length: int, first: int) -> dict[str, Any]:
+    """The statistics of an episode."""
+    found = {name: statistics(values) for name, values in columns(episode, length, first).items()}
+    for camera, name in enumerate(("front", "wrist")):
+        found[f"observation.images.{name}"] = statistics(pixels(episode, length, camera))
+    return found
+
+
 def write_old(root: Path, version: str = "v2.1", modality: Any = MODALITY) -> Path:
     """A data set of v2.0 or v2.1: a file for each episode, two episodes in a chunk."""
     import pyarrow.parquet as pq
@@ -153,6 +175,17 @@ def write_old(root: Path, version: str = "v2.1", modality: Any = MODALITY) -> Pa
             for episode, length in enumerate(LENGTHS)
         ],
     )
+    starts = np.cumsum([0, *LENGTHS]).tolist()
+    if version == "v2.1":
+        stats = [
+            {"episode_index": episode, "stats": all_statistics(episode, length, starts[episode])}
+            for episode, length in enumerate(LENGTHS)
+        ]
+        write_lines(meta / "episodes_stats.jsonl", stats)
+    else:
+        parts = [columns(*one) for one in zip(range(len(LENGTHS)), LENGTHS, starts, strict=False)]
+        joined = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+        write_json(meta / "stats.json", {name: statistics(values) for name, values in joined.items()})
     for episode, length in enumerate(LENGTHS):
         chunk = f"chunk-{episode // 2:03d}"
         path = root / "data" / chunk / f"episode_{episode:06d}.parquet"

@@ -1,7 +1,7 @@
 """Statistics of features, by lerobot's rules: of one episode, and of several together.
 
-Quantiles of an episode come from a histogram of 5000 bins between minimum and maximum, those of a data set
-are the smallest (up to the median) or the largest of its episodes. Both are as in lerobot's
+Quantiles of an episode come from a histogram of 5000 bins between minimum and maximum. Those of a data set
+are the means of its episodes' quantiles, weighted by their steps. Both are as in lerobot 0.4 to 0.6,
 ``datasets/compute_stats.py``.
 """
 
@@ -110,6 +110,5 @@ def _aggregate(parts: Sequence[Mapping[str, Numbers]]) -> dict[str, Numbers]:
     }
     for name in parts[0]:
         if name.startswith("q") and name[1:].isdigit() and all(name in part for part in parts):
-            widest = np.min if int(name[1:]) <= 50 else np.max
-            found[name] = widest(np.stack([part[name] for part in parts]), axis=0)
+            found[name] = (np.stack([part[name] for part in parts]) * weights).sum(axis=0) / total
     return found

@@ -148,8 +148,9 @@ def _metadata(folder: Path, values: Mapping[str, Any], robot: Robot) -> Requirem
 def _steps(config: Any) -> tuple[int, ...] | None:
     """The ``delta_indices`` of a modality, if they are integers."""
     steps = (config or {}).get("delta_indices")
-    is_known = isinstance(steps, list) and steps and all(type(step) is int for step in steps)
-    return tuple(steps) if is_known else None
+    if not isinstance(steps, list) or not steps or not all(type(step) is int for step in steps):
+        return None
+    return tuple(steps)
 
 
 def _names(given: Any) -> list[str]:
