@@ -30,31 +30,3 @@ const PROCESSORS: [&str; 2] = ["policy_preprocessor", "policy_postprocessor"];
 pub(crate) fn is_processor(name: &str) -> bool {
     PROCESSORS.iter().any(|start| name.starts_with(start))
 }
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn wrappers_are_left_out() {
-        for (name, expected) in [
-            ("a.b.weight", "a.b.weight"),
-            ("_orig_mod.a.weight", "a.weight"),
-            ("backbone._orig_mod.model.weight", "backbone.model.weight"),
-            ("module.a.weight", "a.weight"),
-            ("module._orig_mod.a.weight", "a.weight"),
-            ("_orig_mod.module.a._orig_mod.weight", "a.weight"),
-            ("module.module.a", "a"),
-            ("_orig_mod.weight", "weight"),
-            // Not wrappers.
-            ("a.module.weight", "a.module.weight"),
-            ("modules.a", "modules.a"),
-            ("x_orig_mod.a", "x_orig_mod.a"),
-            ("module", "module"),
-            ("a._orig_mod", "a._orig_mod"),
-            ("", ""),
-        ] {
-            assert_eq!(plain_name(name), expected);
-        }
-    }
-}

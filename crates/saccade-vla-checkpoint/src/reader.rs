@@ -416,6 +416,3 @@ fn from_little_endian<T: Copy>(values: &mut [T], convert: impl Fn(T) -> T) {
         values.iter_mut().for_each(|value| *value = convert(*value));
     }
 }
-
-#[cfg(test)]
-mod tests;

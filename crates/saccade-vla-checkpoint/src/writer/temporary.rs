@@ -127,24 +127,4 @@ mod tests {
         assert!(!path.exists());
         std::fs::remove_dir_all(parent).unwrap();
     }
-
-    #[test]
-    fn threads_get_different_directories() {
-        let parent = std::env::temp_dir().join(format!("saccade-temporary-{}", unique()));
-        let out = parent.join("out");
-        std::thread::scope(|scope| {
-            for _ in 0..8 {
-                scope.spawn(|| {
-                    for _ in 0..50 {
-                        let one = TemporaryDirectory::next_to(&out).unwrap();
-                        let file = one.path().join("file");
-                        std::fs::File::create_new(&file).expect("nobody else writes here");
-                        assert!(file.exists(), "nobody else removes it");
-                    }
-                });
-            }
-        });
-        assert_eq!(std::fs::read_dir(&parent).unwrap().count(), 0);
-        std::fs::remove_dir_all(parent).unwrap();
-    }
 }
