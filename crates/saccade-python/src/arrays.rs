@@ -1,5 +1,7 @@
 //! Arrays of Python as views, and arrays of the core as NumPy's.
 
+use std::str::FromStr;
+
 use numpy::{
     Element, IntoPyArray, PyArrayDyn, PyArrayMethods, PyReadonlyArrayDyn, PyReadwriteArrayDyn,
     PyUntypedArrayMethods,
@@ -59,7 +61,7 @@ pub(crate) fn view_mut<'a>(
 }
 
 /// A copy, or a `MemoryError`.
-pub(crate) fn copied<T: Copy>(what: &'static str, data: &[T]) -> PyResult<Vec<T>> {
+fn copied<T: Copy>(what: &'static str, data: &[T]) -> PyResult<Vec<T>> {
     collected(what, data, |element| element)
 }
 
@@ -92,6 +94,21 @@ pub(crate) fn owned_to_numpy<T: Element>(
     to_numpy(py, data, &shape)
 }
 
+/// A copy of what an object of the core holds, which errors call `what`.
+pub(crate) fn copied_to_numpy<'py, T: Element + Copy>(
+    py: Python<'py>,
+    what: &'static str,
+    data: &[T],
+    shape: &[usize],
+) -> PyResult<Bound<'py, PyArrayDyn<T>>> {
+    to_numpy(py, copied(what, data)?, shape)
+}
+
+/// An array of one axis.
+pub(crate) fn row_to_numpy<T: Element>(py: Python<'_>, row: Vec<T>) -> Bound<'_, PyArrayDyn<T>> {
+    row.into_pyarray(py).to_dyn().clone()
+}
+
 pub(crate) fn owned(array: &PyReadonlyArrayDyn<'_, f32>) -> PyResult<OwnedArray> {
     OwnedArray::new(copied("intervention", array.as_slice()?)?, array.shape()).map_err(raise)
 }
@@ -103,37 +120,64 @@ pub(crate) enum PyTensor<'py> {
     Half((String, PyReadonlyArrayDyn<'py, u16>)),
 }
 
-pub(crate) fn held_tensors<'py>(tensors: &Bound<'py, PyDict>) -> PyResult<Vec<(String, PyTensor<'py>)>> {
-    let held = tensors
-        .iter()
-        .map(|(name, tensor)| Ok((name.extract()?, tensor.extract()?)));
-    held.collect()
+/// Tensors by name.
+pub(crate) struct PyTensors<'py>(Vec<(String, PyTensor<'py>)>);
+
+impl<'py> FromPyObject<'_, 'py> for PyTensors<'py> {
+    type Error = PyErr;
+
+    fn extract(object: Borrowed<'_, 'py, PyAny>) -> PyResult<Self> {
+        let tensors = object.cast::<PyDict>()?.iter();
+        let held = tensors.map(|(name, tensor)| Ok((name.extract()?, tensor.extract()?)));
+        held.collect::<PyResult<_>>().map(Self)
+    }
 }
 
-pub(crate) fn tensor_views<'a>(held: &'a [(String, PyTensor<'_>)]) -> PyResult<TensorViews<'a>> {
-    let view = |tensor: &'a PyTensor<'_>| {
-        Ok::<_, PyErr>(match tensor {
-            PyTensor::Float32(array) => {
-                TensorView::new(array.shape(), ElementsRef::F32(array.as_slice()?)).map_err(raise)?
-            }
-            PyTensor::Half((dtype, array)) => {
+impl PyTensors<'_> {
+    pub(crate) fn views(&self) -> PyResult<TensorViews<'_>> {
+        let held = self.0.iter();
+        held.map(|(name, tensor)| Ok((name.clone(), tensor.view()?)))
+            .collect()
+    }
+}
+
+impl PyTensor<'_> {
+    fn view(&self) -> PyResult<TensorView<'_>> {
+        let (shape, elements) = match self {
+            Self::Float32(array) => (array.shape(), ElementsRef::F32(array.as_slice()?)),
+            Self::Half((dtype, array)) => {
                 let bits = array.as_slice()?;
                 let elements = match dtype.as_str() {
                     "bfloat16" => ElementsRef::Bf16(bits),
                     "float16" => ElementsRef::F16(bits),
                     _ => {
-                        return Err(raise(Error::Input(Problem::expected(
-                            "tensors",
-                            "float32, bfloat16 or float16",
-                            dtype,
-                        ))));
+                        let expected = "float32, bfloat16 or float16";
+                        return Err(raise(Error::Input(Problem::expected("tensors", expected, dtype))));
                     }
                 };
-                TensorView::new(array.shape(), elements).map_err(raise)?
+                (array.shape(), elements)
             }
-        })
-    };
-    held.iter()
-        .map(|(name, tensor)| Ok((name.clone(), view(tensor)?)))
-        .collect()
+        };
+        TensorView::new(shape, elements).map_err(raise)
+    }
 }
+
+/// An argument that names one of several things, such as a precision.
+pub(crate) struct Named<T>(pub T);
+
+impl<T: FromStr<Err = Error>> FromPyObject<'_, '_> for Named<T> {
+    type Error = PyErr;
+
+    fn extract(name: Borrowed<'_, '_, PyAny>) -> PyResult<Self> {
+        name.extract::<String>()?.parse().map(Self).map_err(raise)
+    }
+}
+
+/// Sets fields of a struct in a dict, each under its own name.
+macro_rules! set_fields {
+    ($dict:expr, $of:expr; $($field:ident)*) => {
+        $($dict.set_item(stringify!($field), &$of.$field)?;)*
+    };
+}
+
+pub(crate) use set_fields;

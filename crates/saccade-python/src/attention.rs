@@ -2,12 +2,10 @@
 
 use numpy::{PyReadonlyArrayDyn, PyReadwriteArrayDyn, PyUntypedArrayMethods};
 use pyo3::prelude::*;
-use pyo3::types::PyDict;
-use saccade_vla::KeyOptions;
+use saccade_vla::{KeyOptions, Precision};
 
-use crate::arrays::{Mask, held_tensors, optional_view, tensor_views, view, view_mut};
+use crate::arrays::{Mask, Named, PyTensors, optional_view, view, view_mut};
 use crate::detached::call;
-use crate::error::raise;
 
 #[pyclass(frozen, module = "saccade._saccade")]
 pub(crate) struct KeyValues(saccade_vla::KeyValues);
@@ -36,14 +34,15 @@ pub(crate) struct CrossAttention(saccade_vla::CrossAttention);
 #[pymethods]
 impl CrossAttention {
     #[new]
-    fn new(py: Python<'_>, tensors: &Bound<'_, PyDict>, num_heads: usize, precision: &str) -> PyResult<Self> {
-        let precision = precision.parse().map_err(raise)?;
-        let held = held_tensors(tensors)?;
-        let views = tensor_views(&held)?;
-        call(py, || {
-            saccade_vla::CrossAttention::new(&views, num_heads, precision, None)
-        })
-        .map(Self)
+    fn new(
+        py: Python<'_>,
+        tensors: PyTensors<'_>,
+        num_heads: usize,
+        precision: Named<Precision>,
+    ) -> PyResult<Self> {
+        let views = tensors.views()?;
+        let made = || saccade_vla::CrossAttention::new(&views, num_heads, precision.0, None);
+        call(py, made).map(Self)
     }
 
     #[getter]

@@ -6,11 +6,12 @@ use std::sync::Arc;
 use numpy::{PyArrayDyn, PyReadonlyArrayDyn};
 use pyo3::prelude::*;
 use pyo3::types::{PyDict, PyTuple};
-use saccade_vla::{BackboneConfig, BackboneInputs, BackboneKeep, BackboneLoadOptions, OwnedArray};
+use saccade_vla::{BackboneConfig, BackboneInputs, BackboneKeep, BackboneLoadOptions, OwnedArray, Precision};
 
-use crate::arrays::{Mask, held_tensors, optional_view, owned_to_numpy, tensor_views, to_numpy, view};
+use crate::arrays::{
+    Mask, Named, PyTensors, optional_view, owned_to_numpy, row_to_numpy, set_fields, to_numpy, view,
+};
 use crate::detached::call;
-use crate::error::raise;
 
 /// The fields of a `saccade.BackboneInputs`.
 #[derive(FromPyObject)]
@@ -34,7 +35,8 @@ impl PyInputs<'_> {
     }
 }
 
-#[pyclass(frozen, module = "saccade._saccade")]
+#[derive(Clone)]
+#[pyclass(frozen, from_py_object, module = "saccade._saccade")]
 pub(crate) struct BackboneFeatures(pub(crate) Arc<saccade_vla::BackboneFeatures>);
 
 #[pymethods]
@@ -70,13 +72,10 @@ impl BackboneFeatures {
     }
 
     /// For each prompt the places of the image tokens of its views.
-    fn views<'py>(&self, py: Python<'py>) -> PyResult<Vec<Vec<Bound<'py, PyArrayDyn<i64>>>>> {
-        let places = |view: &[usize]| {
-            let places: Vec<i64> = view.iter().map(|&place| place as i64).collect();
-            let len = places.len();
-            to_numpy(py, places, &[len])
-        };
-        (0..self.0.batch())
+    fn views<'py>(&self, py: Python<'py>) -> Vec<Vec<Bound<'py, PyArrayDyn<i64>>>> {
+        let places = |view: &[usize]| row_to_numpy(py, view.iter().map(|&place| place as i64).collect());
+        let prompts = 0..self.0.batch();
+        prompts
             .map(|prompt| self.0.views(prompt).map(places).collect())
             .collect()
     }
@@ -99,24 +98,31 @@ impl Backbone {
         py: Python<'_>,
         source: PathBuf,
         config: Option<String>,
-        precision: &str,
+        precision: Named<Precision>,
         num_threads: Option<usize>,
     ) -> PyResult<Self> {
-        let options = options(config, precision, num_threads)?;
+        let options = BackboneLoadOptions {
+            config,
+            precision: precision.0,
+            num_threads,
+        };
         call(py, || saccade_vla::Backbone::load(&source, &options)).map(|made| Self(Arc::new(made)))
     }
 
     #[staticmethod]
     fn from_tensors(
         py: Python<'_>,
-        tensors: &Bound<'_, PyDict>,
+        tensors: PyTensors<'_>,
         config: Option<String>,
-        precision: &str,
+        precision: Named<Precision>,
         num_threads: Option<usize>,
     ) -> PyResult<Self> {
-        let options = options(config, precision, num_threads)?;
-        let held = held_tensors(tensors)?;
-        let views = tensor_views(&held)?;
+        let options = BackboneLoadOptions {
+            config,
+            precision: precision.0,
+            num_threads,
+        };
+        let views = tensors.views()?;
         call(py, || saccade_vla::Backbone::from_tensors(&views, &options)).map(|made| Self(Arc::new(made)))
     }
 
@@ -149,15 +155,13 @@ impl Backbone {
         &self,
         py: Python<'py>,
         inputs: Vec<PyInputs<'py>>,
-        previous: Vec<PyRef<'py, BackboneFeatures>>,
+        previous: Vec<BackboneFeatures>,
         hidden: bool,
         vision: bool,
         image_tokens: bool,
     ) -> PyResult<Vec<(BackboneFeatures, PyBackboneRecord<'py>)>> {
         let views = inputs.iter().map(PyInputs::view).collect::<PyResult<Vec<_>>>()?;
-        let previous: Vec<_> = previous.iter().map(|features| Arc::clone(&features.0)).collect();
-        let previous: Vec<&saccade_vla::BackboneFeatures> =
-            previous.iter().map(|features| &**features).collect();
+        let previous: Vec<_> = previous.iter().map(|features| &*features.0).collect();
         let keep = BackboneKeep {
             hidden,
             vision,
@@ -189,10 +193,8 @@ pub(crate) struct BackboneCheckpoint(saccade_vla::BackboneCheckpoint);
 impl BackboneCheckpoint {
     #[staticmethod]
     fn open(py: Python<'_>, source: PathBuf, config: Option<String>) -> PyResult<Self> {
-        call(py, || {
-            saccade_vla::BackboneCheckpoint::open(&source, config.as_deref())
-        })
-        .map(Self)
+        let open = || saccade_vla::BackboneCheckpoint::open(&source, config.as_deref());
+        call(py, open).map(Self)
     }
 
     fn config<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
@@ -204,55 +206,26 @@ impl BackboneCheckpoint {
         self.0.prefix()
     }
 
-    fn nbytes(&self, precision: &str) -> PyResult<usize> {
-        self.0.nbytes(precision.parse().map_err(raise)?).map_err(raise)
+    fn nbytes(&self, py: Python<'_>, precision: Named<Precision>) -> PyResult<usize> {
+        call(py, || self.0.nbytes(precision.0))
     }
-}
-
-fn options(
-    config: Option<String>,
-    precision: &str,
-    num_threads: Option<usize>,
-) -> PyResult<BackboneLoadOptions> {
-    Ok(BackboneLoadOptions {
-        config,
-        precision: precision.parse().map_err(raise)?,
-        num_threads,
-    })
 }
 
 fn backbone_config_dict<'py>(py: Python<'py>, config: &BackboneConfig) -> PyResult<Bound<'py, PyDict>> {
     let dict = PyDict::new(py);
     let (vision, language) = (&config.vision, &config.language);
     dict.set_item("version", config.version.name())?;
-    for (name, size) in [
-        ("feature_dim", config.feature_dim()),
-        ("image_token_id", config.image_token_id),
-        ("width", language.width),
-        ("num_layers", language.num_layers),
-        ("num_heads", language.num_heads),
-        ("num_kv_heads", language.num_kv_heads),
-        ("head_dim", language.head_dim),
-        ("hidden_dim", language.hidden_dim),
-        ("vocab_size", language.vocab_size),
-        ("vision_width", vision.width),
-        ("vision_num_layers", vision.num_layers),
-        ("vision_num_heads", vision.num_heads),
-        ("vision_head_dim", vision.head_dim),
-        ("vision_hidden_dim", vision.hidden_dim),
-        ("patch_size", vision.patch_size),
-        ("num_positions", vision.num_positions),
-        ("merge", vision.merge),
-        ("connector_layers", vision.connector_layers),
-    ] {
-        dict.set_item(name, size)?;
-    }
-    dict.set_item("project_to_dim", config.project_to_dim)?;
-    dict.set_item("image_size", vision.image_size)?;
-    dict.set_item("rope_theta", language.rope_theta)?;
-    dict.set_item("norm_eps", language.norm_eps)?;
+    dict.set_item("feature_dim", config.feature_dim())?;
+    set_fields!(dict, config; image_token_id project_to_dim);
+    set_fields!(dict, language;
+        width num_layers num_heads num_kv_heads head_dim hidden_dim vocab_size rope_theta norm_eps has_final_norm);
+    set_fields!(dict, vision; patch_size num_positions merge connector_layers image_size);
+    dict.set_item("vision_width", vision.width)?;
+    dict.set_item("vision_num_layers", vision.num_layers)?;
+    dict.set_item("vision_num_heads", vision.num_heads)?;
+    dict.set_item("vision_head_dim", vision.head_dim)?;
+    dict.set_item("vision_hidden_dim", vision.hidden_dim)?;
     dict.set_item("vision_norm_eps", vision.norm_eps)?;
-    dict.set_item("has_final_norm", language.has_final_norm)?;
     let mrope_section = language.mrope_section.map(|section| PyTuple::new(py, section));
     dict.set_item("mrope_section", mrope_section.transpose()?)?;
     dict.set_item("deepstack", PyTuple::new(py, &vision.deepstack)?)?;

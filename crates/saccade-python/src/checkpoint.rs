@@ -6,13 +6,12 @@ use std::path::PathBuf;
 use numpy::PyArrayDyn;
 use pyo3::prelude::*;
 use pyo3::types::{PyBytes, PyDict};
-use saccade_vla::TensorFacts;
 use saccade_vla::files::Checkpoint;
+use saccade_vla::{Precision, TensorFacts};
 
-use crate::arrays::to_numpy;
+use crate::arrays::{Named, to_numpy};
 use crate::config::config_dict;
 use crate::detached::call;
-use crate::error::raise;
 
 /// Every tensor whose name begins with `prefix`, as float32, by the rest of its name.
 #[pyfunction]
@@ -79,10 +78,8 @@ pub(crate) struct HeadCheckpoint(saccade_vla::HeadCheckpoint);
 impl HeadCheckpoint {
     #[staticmethod]
     fn open(py: Python<'_>, source: PathBuf, config: Option<String>) -> PyResult<Self> {
-        call(py, || {
-            saccade_vla::HeadCheckpoint::open(&source, config.as_deref())
-        })
-        .map(Self)
+        let open = || saccade_vla::HeadCheckpoint::open(&source, config.as_deref());
+        call(py, open).map(Self)
     }
 
     /// The base of the adapter in a directory.
@@ -93,10 +90,8 @@ impl HeadCheckpoint {
         config: Option<String>,
         adapter: Option<PathBuf>,
     ) -> PyResult<Self> {
-        call(py, || {
-            saccade_vla::open_base(&source, config.as_deref(), adapter.as_deref())
-        })
-        .map(Self)
+        let open = || saccade_vla::open_base(&source, config.as_deref(), adapter.as_deref());
+        call(py, open).map(Self)
     }
 
     fn config<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
@@ -161,8 +156,7 @@ impl HeadCheckpoint {
         to_numpy(py, data, &shape[usize::from(index.is_some())..])
     }
 
-    fn nbytes(&self, py: Python<'_>, precision: &str, num_embodiments: usize) -> PyResult<usize> {
-        let precision = precision.parse().map_err(raise)?;
-        call(py, || self.0.nbytes(precision, num_embodiments))
+    fn nbytes(&self, py: Python<'_>, precision: Named<Precision>, num_embodiments: usize) -> PyResult<usize> {
+        call(py, || self.0.nbytes(precision.0, num_embodiments))
     }
 }

@@ -4,6 +4,7 @@ use pyo3::prelude::*;
 use pyo3::types::{PyDict, PyTuple};
 use saccade_vla::HeadConfig;
 
+use crate::arrays::set_fields;
 use crate::detached::call;
 
 pub(crate) fn config_dict<'py>(py: Python<'py>, config: &HeadConfig) -> PyResult<Bound<'py, PyDict>> {
@@ -15,38 +16,11 @@ pub(crate) fn config_dict<'py>(py: Python<'py>, config: &HeadConfig) -> PyResult
     let future_key_bias = config.future_key_bias.as_ref();
     let future_key_bias = future_key_bias.map(|bias| PyTuple::new(py, bias)).transpose()?;
     dict.set_item("future_key_bias", future_key_bias)?;
-    for (name, flag) in [
-        ("interleave_self_attention", config.interleave_self_attention),
-        ("use_vlln", config.use_vlln),
-        ("add_pos_embed", config.add_pos_embed),
-    ] {
-        dict.set_item(name, flag)?;
-    }
-    for (name, size) in [
-        ("width", config.width),
-        ("num_layers", config.num_layers),
-        ("num_heads", config.num_heads),
-        ("head_dim", config.head_dim),
-        ("context_dim", config.context_dim),
-        ("attend_text_every_n_blocks", config.attend_text_every_n_blocks),
-        ("vl_num_layers", config.vl_num_layers),
-        ("vl_num_heads", config.vl_num_heads),
-        ("vl_head_dim", config.vl_head_dim),
-        ("num_future_tokens", config.num_future_tokens),
-        ("action_horizon", config.action_horizon),
-        ("action_dim", config.action_dim),
-        ("encoder_action_dim", config.encoder_action_dim),
-        ("state_dim", config.state_dim),
-        ("state_history", config.state_history),
-        ("num_states", config.num_states),
-        ("hidden_dim", config.hidden_dim),
-        ("num_embodiments", config.num_embodiments),
-        ("num_timestep_buckets", config.num_timestep_buckets),
-        ("num_steps", config.num_steps),
-        ("max_positions", config.max_positions),
-    ] {
-        dict.set_item(name, size)?;
-    }
+    set_fields!(dict, config;
+        interleave_self_attention use_vlln add_pos_embed width num_layers num_heads head_dim context_dim
+        attend_text_every_n_blocks vl_num_layers vl_num_heads vl_head_dim num_future_tokens action_horizon
+        action_dim encoder_action_dim state_dim state_history num_states hidden_dim num_embodiments
+        num_timestep_buckets num_steps max_positions);
     Ok(dict)
 }
 

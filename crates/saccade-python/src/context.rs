@@ -5,9 +5,10 @@ use std::sync::Arc;
 use numpy::PyArrayDyn;
 use pyo3::prelude::*;
 
-use crate::arrays::{copied, to_numpy};
+use crate::arrays::copied_to_numpy;
 
-#[pyclass(frozen, module = "saccade._saccade")]
+#[derive(Clone)]
+#[pyclass(frozen, from_py_object, module = "saccade._saccade")]
 pub(crate) struct Context(pub(crate) Arc<saccade_vla::Context>);
 
 #[pymethods]
@@ -30,16 +31,14 @@ impl Context {
     fn vl_embs<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArrayDyn<f32>>> {
         let rows = self.0.batch() * self.0.num_vl_tokens();
         let data = self.0.vl_embs();
-        to_numpy(
-            py,
-            copied("vl_embs", data)?,
-            &[self.0.batch(), self.0.num_vl_tokens(), data.len() / rows],
-        )
+        let shape = [self.0.batch(), self.0.num_vl_tokens(), data.len() / rows];
+        copied_to_numpy(py, "vl_embs", data, &shape)
     }
 
     fn image_mask<'py>(&self, py: Python<'py>) -> PyResult<Option<Bound<'py, PyArrayDyn<bool>>>> {
         let shape = [self.0.batch(), self.0.num_vl_tokens()];
-        let to_numpy = |mask| to_numpy(py, copied("image_mask", mask)?, &shape);
-        self.0.image_mask().map(to_numpy).transpose()
+        let mask = self.0.image_mask();
+        mask.map(|mask| copied_to_numpy(py, "image_mask", mask, &shape))
+            .transpose()
     }
 }

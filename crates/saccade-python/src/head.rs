@@ -7,11 +7,11 @@ use numpy::{PyArrayDyn, PyReadonlyArrayDyn, PyReadwriteArrayDyn, PyUntypedArrayM
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 use saccade_vla::{
-    Chunking, FeatureBatch, Features, Group, Integrator, Keep, LoadOptions, NoisyActions, Sampling,
-    TraceOptions,
+    Chunking, FeatureBatch, Features, Group, Integrator, Keep, LoadOptions, NoisyActions, Precision,
+    Sampling, TraceOptions,
 };
 
-use crate::arrays::{Mask, copied, held_tensors, optional_view, tensor_views, to_numpy, view, view_mut};
+use crate::arrays::{Mask, Named, PyTensors, copied_to_numpy, optional_view, owned_to_numpy, view, view_mut};
 use crate::backbone::BackboneFeatures;
 use crate::config::config_dict;
 use crate::context::Context;
@@ -33,7 +33,7 @@ impl ActionHead {
         embodiment_ids: Option<Vec<i64>>,
         action_horizon: Option<usize>,
         num_states: Option<usize>,
-        precision: &str,
+        precision: Named<Precision>,
         num_threads: Option<usize>,
     ) -> PyResult<Self> {
         let options = LoadOptions {
@@ -41,7 +41,7 @@ impl ActionHead {
             embodiment_ids,
             action_horizon,
             num_states,
-            precision: precision.parse().map_err(raise)?,
+            precision: precision.0,
             num_threads,
         };
         call(py, || saccade_vla::ActionHead::load(&source, &options)).map(|made| Self(Arc::new(made)))
@@ -50,23 +50,22 @@ impl ActionHead {
     #[staticmethod]
     fn from_tensors(
         py: Python<'_>,
-        tensors: &Bound<'_, PyDict>,
+        tensors: PyTensors<'_>,
         config: String,
         embodiment_ids: Option<Vec<i64>>,
         num_states: Option<usize>,
-        precision: &str,
+        precision: Named<Precision>,
         num_threads: Option<usize>,
     ) -> PyResult<Self> {
         let options = LoadOptions {
             config: Some(config),
             embodiment_ids,
             num_states,
-            precision: precision.parse().map_err(raise)?,
+            precision: precision.0,
             num_threads,
             ..LoadOptions::default()
         };
-        let held = held_tensors(tensors)?;
-        let views = tensor_views(&held)?;
+        let views = tensors.views()?;
         call(py, || saccade_vla::ActionHead::from_tensors(&views, &options)).map(|made| Self(Arc::new(made)))
     }
 
@@ -81,7 +80,7 @@ impl ActionHead {
 
     fn future_tokens<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArrayDyn<f32>>> {
         let tokens = self.0.future_tokens();
-        to_numpy(py, copied("future_tokens", tokens.data())?, tokens.shape())
+        copied_to_numpy(py, "future_tokens", tokens.data(), tokens.shape())
     }
 
     #[getter]
@@ -141,17 +140,9 @@ impl ActionHead {
     }
 
     /// The context of features that a backbone of saccade's made.
-    fn encode_features(
-        &self,
-        py: Python<'_>,
-        features: Vec<PyRef<'_, BackboneFeatures>>,
-    ) -> PyResult<Context> {
-        let features: Vec<_> = features.iter().map(|features| Arc::clone(&features.0)).collect();
-        let context = call(py, || {
-            let features: Vec<&saccade_vla::BackboneFeatures> =
-                features.iter().map(|features| &**features).collect();
-            self.0.encode(&FeatureBatch::new(&features)?.as_features())
-        })?;
+    fn encode_features(&self, py: Python<'_>, features: Vec<BackboneFeatures>) -> PyResult<Context> {
+        let features: Vec<_> = features.iter().map(|features| &*features.0).collect();
+        let context = call(py, || self.0.encode(&FeatureBatch::new(&features)?.as_features()))?;
         Ok(Context(Arc::new(context)))
     }
 
@@ -239,8 +230,7 @@ impl ActionHead {
             let range = trace.groups.range(group);
             rows.set_item(group.name(), (range.start, range.end))?;
         }
-        let (actions, shape) = trace.actions.into_parts();
-        let actions = to_numpy(py, actions, &shape)?;
+        let actions = owned_to_numpy(py, trace.actions)?;
         Ok((recorded(py, trace.recorded)?, rows, actions))
     }
 

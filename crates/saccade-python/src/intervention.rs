@@ -7,11 +7,11 @@ use pyo3::prelude::*;
 use pyo3::types::PyDict;
 use saccade_vla::{Group, OwnedArray, Patch, Recorded, Tokens};
 
-use crate::arrays::{owned, to_numpy};
+use crate::arrays::{owned, owned_to_numpy};
 use crate::error::raise;
 
 /// A group's name and indices.
-pub(crate) type PyTokens = (String, Option<Vec<usize>>);
+type PyTokens = (String, Option<Vec<usize>>);
 
 /// The fields of a `saccade.Intervention` by name, as its constructor normalised them; mappings are lists of their items.
 #[derive(FromPyObject)]
@@ -26,12 +26,12 @@ pub(crate) struct PyIntervention<'py> {
     heads: Option<Vec<usize>>,
 }
 
-pub(crate) fn tokens((name, indices): PyTokens) -> PyResult<Tokens> {
+fn tokens((name, indices): PyTokens) -> PyResult<Tokens> {
     let group = Group::from_name(&name).map_err(raise)?;
     Ok(Tokens { group, indices })
 }
 
-pub(crate) fn intervention(given: PyIntervention<'_>) -> PyResult<saccade_vla::Intervention> {
+fn intervention(given: PyIntervention<'_>) -> PyResult<saccade_vla::Intervention> {
     let cut = |(reader, source)| Ok((tokens(reader)?, tokens(source)?));
     let key_bias = |(keys, bias)| Ok((tokens(keys)?, owned(&bias)?));
     let patch = |((step, block), patched, rows)| {
@@ -43,13 +43,9 @@ pub(crate) fn intervention(given: PyIntervention<'_>) -> PyResult<saccade_vla::I
         })
     };
     Ok(saccade_vla::Intervention {
-        cut: given.cut.into_iter().map(cut).collect::<PyResult<_>>()?,
-        key_bias: given
-            .key_bias
-            .into_iter()
-            .map(key_bias)
-            .collect::<PyResult<_>>()?,
-        patch: given.patch.into_iter().map(patch).collect::<PyResult<_>>()?,
+        cut: collected(given.cut, cut)?,
+        key_bias: collected(given.key_bias, key_bias)?,
+        patch: collected(given.patch, patch)?,
         future_tokens: given.future_tokens.as_ref().map(owned).transpose()?,
         blocks: given.blocks,
         steps: given.steps,
@@ -58,7 +54,11 @@ pub(crate) fn intervention(given: PyIntervention<'_>) -> PyResult<saccade_vla::I
 }
 
 pub(crate) fn interventions(given: Vec<PyIntervention<'_>>) -> PyResult<Vec<saccade_vla::Intervention>> {
-    given.into_iter().map(intervention).collect()
+    collected(given, intervention)
+}
+
+fn collected<T, R>(given: Vec<T>, made: impl FnMut(T) -> PyResult<R>) -> PyResult<Vec<R>> {
+    given.into_iter().map(made).collect()
 }
 
 /// Attention and hidden rows, each by block, or by step and block.
@@ -71,8 +71,7 @@ pub(crate) fn recorded<'py, Key: IntoPyObject<'py>>(
     let to_dict = |arrays: BTreeMap<Key, OwnedArray>| {
         let dict = PyDict::new(py);
         for (key, array) in arrays {
-            let (data, shape) = array.into_parts();
-            dict.set_item(key, to_numpy(py, data, &shape)?)?;
+            dict.set_item(key, owned_to_numpy(py, array)?)?;
         }
         Ok::<_, PyErr>(dict)
     };

@@ -2,27 +2,21 @@
 
 use numpy::{PyArrayDyn, PyReadonlyArrayDyn};
 use pyo3::prelude::*;
-use saccade_vla::{Array, OwnedArray, linalg};
+use saccade_vla::{Array, linalg};
 
-use crate::arrays::{copied, to_numpy, view};
+use crate::arrays::{copied_to_numpy, owned_to_numpy, row_to_numpy, view};
 use crate::detached::call;
 
 type PyRows<'py> = PyReadonlyArrayDyn<'py, f64>;
 type PyMade<'py> = Bound<'py, PyArrayDyn<f64>>;
 
-/// A result of the core as NumPy's array, without a copy.
-fn made(py: Python<'_>, array: OwnedArray<f64>) -> PyResult<PyMade<'_>> {
-    let (data, shape) = array.into_parts();
-    to_numpy(py, data, &shape)
-}
-
 /// What an object of the core holds, copied.
 fn held<'py>(py: Python<'py>, array: Array<'_, f64>) -> PyResult<PyMade<'py>> {
-    to_numpy(py, copied("linear algebra", array.data())?, array.shape())
+    copied_to_numpy(py, "linear algebra", array.data(), array.shape())
 }
 
 fn held_row<'py>(py: Python<'py>, row: &[f64]) -> PyResult<PyMade<'py>> {
-    to_numpy(py, copied("linear algebra", row)?, &[row.len()])
+    copied_to_numpy(py, "linear algebra", row, &[row.len()])
 }
 
 #[pyclass(frozen, module = "saccade._saccade")]
@@ -53,7 +47,7 @@ impl Standardizer {
 
     fn transform<'py>(&self, py: Python<'py>, x: PyRows<'_>) -> PyResult<PyMade<'py>> {
         let x = view(&x)?;
-        made(py, call(py, || self.0.transform(x))?)
+        owned_to_numpy(py, call(py, || self.0.transform(x))?)
     }
 }
 
@@ -90,7 +84,7 @@ impl Pca {
 
     fn transform<'py>(&self, py: Python<'py>, x: PyRows<'_>) -> PyResult<PyMade<'py>> {
         let x = view(&x)?;
-        made(py, call(py, || self.0.transform(x))?)
+        owned_to_numpy(py, call(py, || self.0.transform(x))?)
     }
 }
 
@@ -117,7 +111,7 @@ impl Ridge {
 
     fn predict<'py>(&self, py: Python<'py>, x: PyRows<'_>) -> PyResult<PyMade<'py>> {
         let x = view(&x)?;
-        made(py, call(py, || self.0.predict(x))?)
+        owned_to_numpy(py, call(py, || self.0.predict(x))?)
     }
 }
 
@@ -130,7 +124,5 @@ pub(crate) fn linear_cka(py: Python<'_>, x: PyRows<'_>, y: PyRows<'_>) -> PyResu
 #[pyfunction]
 pub(crate) fn principal_angles<'py>(py: Python<'py>, a: PyRows<'_>, b: PyRows<'_>) -> PyResult<PyMade<'py>> {
     let (a, b) = (view(&a)?, view(&b)?);
-    let angles = call(py, || linalg::principal_angles(a, b))?;
-    let shape = [angles.len()];
-    to_numpy(py, angles, &shape)
+    Ok(row_to_numpy(py, call(py, || linalg::principal_angles(a, b))?))
 }

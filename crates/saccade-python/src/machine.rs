@@ -14,14 +14,11 @@ use crate::error::raise;
 #[pyfunction]
 pub(crate) fn measure_peaks(py: Python<'_>, num_threads: usize) -> PyResult<Bound<'_, PyDict>> {
     if num_threads == 0 {
-        return Err(raise(Error::Input(Problem::expected(
-            "num_threads",
-            "at least 1",
-            "0",
-        ))));
+        let problem = Problem::expected("num_threads", "at least 1", "0");
+        return Err(raise(Error::Input(problem)));
     }
     let mut isas = Isa::available();
-    let selected = Isa::from_env().map_err(|error| raise(error.into()))?;
+    let selected = selected()?;
     // Software tiles can be selected, and are not among those that are available.
     if !isas.contains(&selected) {
         isas.push(selected);
@@ -118,7 +115,16 @@ impl PyProfile {
 
     /// `(calls, seconds, multiply_adds, bytes)` by part, once the context is left.
     fn counters<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
-        counters(py, &self.counted)
+        let dict = PyDict::new(py);
+        for part in Part::ALL {
+            let counter = self.counted.part(part);
+            let seconds = counter.time.as_secs_f64();
+            dict.set_item(
+                part.name(),
+                (counter.calls, seconds, counter.multiply_adds, counter.bytes),
+            )?;
+        }
+        Ok(dict)
     }
 
     /// The names of the kernels of linear layers by part, once the context is left.
@@ -133,40 +139,23 @@ impl PyProfile {
     }
 }
 
-fn counters<'py>(py: Python<'py>, profile: &Profile) -> PyResult<Bound<'py, PyDict>> {
-    let dict = PyDict::new(py);
-    for part in Part::ALL {
-        let counter = profile.part(part);
-        dict.set_item(
-            part.name(),
-            (
-                counter.calls,
-                counter.time.as_secs_f64(),
-                counter.multiply_adds,
-                counter.bytes,
-            ),
-        )?;
-    }
-    Ok(dict)
-}
-
 #[pyfunction]
 pub(crate) fn available_isas() -> Vec<String> {
     Isa::available().iter().map(Isa::to_string).collect()
 }
 
+fn selected() -> PyResult<Isa> {
+    Isa::from_env().map_err(|error| raise(error.into()))
+}
+
 #[pyfunction]
 pub(crate) fn selected_isa() -> PyResult<String> {
-    Isa::from_env()
-        .map(|isa| isa.to_string())
-        .map_err(|error| raise(error.into()))
+    Ok(selected()?.to_string())
 }
 
 #[pyfunction]
 pub(crate) fn dot_products() -> PyResult<Vec<&'static str>> {
-    Isa::from_env()
-        .map(Isa::dot_products)
-        .map_err(|error| raise(error.into()))
+    Ok(selected()?.dot_products())
 }
 
 /// `(family, rates, tiles)`: what decides which kernels are used.

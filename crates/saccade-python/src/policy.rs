@@ -12,7 +12,7 @@ use crate::head::ActionHead;
 use crate::processor::{Processor, PyObservation};
 
 /// A context of the head, and the features of each observation that it was made from.
-type PyPolicyContext<'py> = (PyRef<'py, Context>, Vec<PyRef<'py, BackboneFeatures>>);
+type PyPolicyContext = (Context, Vec<BackboneFeatures>);
 
 #[pyclass(frozen, module = "saccade._saccade")]
 pub(crate) struct Policy(saccade_vla::Policy);
@@ -32,15 +32,17 @@ impl Policy {
         &self,
         py: Python<'py>,
         observations: Vec<(PyObservation<'py>, bool)>,
-        previous: Option<PyPolicyContext<'py>>,
-    ) -> PyResult<(Context, Vec<BackboneFeatures>)> {
+        previous: Option<PyPolicyContext>,
+    ) -> PyResult<PyPolicyContext> {
         let observations = observations
             .iter()
             .map(|(observation, plain_text)| observation.view(*plain_text))
             .collect::<PyResult<Vec<_>>>()?;
         let previous = previous.map(|(context, features)| {
-            let features = features.iter().map(|features| Arc::clone(&features.0));
-            PolicyContext::new(Arc::clone(&context.0), features.collect())
+            PolicyContext::new(
+                context.0,
+                features.into_iter().map(|features| features.0).collect(),
+            )
         });
         let encoded = call(py, || self.0.encode(&observations, previous.as_ref()))?;
         let features = encoded.features().iter().map(Arc::clone);

@@ -7,9 +7,8 @@ use numpy::{PyArrayDyn, PyReadonlyArrayDyn};
 use pyo3::prelude::*;
 use saccade_vla::{Frame, Observation, Preprocessing, ProcessorOptions, Tokenizer, TokenizerFiles};
 
-use crate::arrays::{owned_to_numpy, to_numpy, view};
+use crate::arrays::{Named, owned_to_numpy, row_to_numpy, view};
 use crate::detached::call;
-use crate::error::raise;
 
 /// A frame as the Python package gives it.
 #[derive(FromPyObject)]
@@ -107,18 +106,14 @@ impl Processor {
         py: Python<'_>,
         version: &str,
         tokenizer: PathBuf,
-        preprocessing: Option<&str>,
+        preprocessing: Option<Named<Preprocessing>>,
         image_size: Option<usize>,
         tokens_per_view: Option<usize>,
         plain_text: bool,
         options: Option<&str>,
     ) -> PyResult<Self> {
-        let preprocessing = preprocessing
-            .map(Preprocessing::named)
-            .transpose()
-            .map_err(raise)?;
         let options = ProcessorOptions {
-            preprocessing,
+            preprocessing: preprocessing.map(|given| given.0),
             image_size,
             tokens_per_view,
             plain_text,
@@ -137,13 +132,10 @@ impl Processor {
         py: Python<'_>,
         source: &ProcessorSource,
         tokenizer: Option<PathBuf>,
-        preprocessing: Option<&str>,
+        preprocessing: Option<Named<Preprocessing>>,
         options: Option<&str>,
     ) -> PyResult<Self> {
-        let preprocessing = preprocessing
-            .map(Preprocessing::named)
-            .transpose()
-            .map_err(raise)?;
+        let preprocessing = preprocessing.map(|given| given.0);
         call(py, || {
             let files = tokenizer.as_deref().map(TokenizerFiles::at).transpose()?;
             source.0.processor(files.as_ref(), preprocessing, options)
@@ -183,9 +175,7 @@ impl Processor {
 
     fn tokens<'py>(&self, py: Python<'py>, text: &str) -> PyResult<Bound<'py, PyArrayDyn<i64>>> {
         let ids = call(py, || self.0.tokens(text))?;
-        let ids: Vec<i64> = ids.into_iter().map(i64::from).collect();
-        let shape = [ids.len()];
-        to_numpy(py, ids, &shape)
+        Ok(row_to_numpy(py, ids.into_iter().map(i64::from).collect()))
     }
 
     fn texts(&self, py: Python<'_>, ids: Vec<i64>) -> PyResult<Vec<String>> {

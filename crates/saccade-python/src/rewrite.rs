@@ -6,9 +6,9 @@ use std::path::{Path, PathBuf};
 use numpy::{PyArrayDyn, PyReadonlyArrayDyn, PyUntypedArrayMethods};
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
-use saccade_vla::{ConvertOptions, Error, Problem, ResizeOptions, RewriteOptions, Written};
+use saccade_vla::{ConvertOptions, Error, Float, Problem, ResizeOptions, RewriteOptions, Written};
 
-use crate::arrays::to_numpy;
+use crate::arrays::{Named, set_fields, to_numpy};
 use crate::detached::call;
 use crate::error::raise;
 
@@ -65,12 +65,9 @@ impl PyRewrite {
     }
 }
 
-fn written_dict(py: Python<'_>, written: Written) -> PyResult<Bound<'_, PyDict>> {
+fn written_dict<'py>(py: Python<'py>, written: &Written) -> PyResult<Bound<'py, PyDict>> {
     let dict = PyDict::new(py);
-    dict.set_item("files", written.files)?;
-    dict.set_item("carried", written.carried)?;
-    dict.set_item("left", written.left)?;
-    dict.set_item("num_dropped", written.num_dropped)?;
+    set_fields!(dict, written; files carried left num_dropped);
     Ok(dict)
 }
 
@@ -79,15 +76,10 @@ pub(crate) fn quantize<'py>(py: Python<'py>, rewrite: PyRewrite) -> PyResult<Bou
     let report = rewrite.run(py, |source, out, options, progress| {
         saccade_vla::quantize(source, out, &options, progress)
     })?;
-    let dict = written_dict(py, report.written)?;
-    dict.set_item("num_quantized", report.num_quantized)?;
-    dict.set_item("num_copied", report.num_copied)?;
-    dict.set_item("head_bytes_before", report.head_bytes_before)?;
-    dict.set_item("head_bytes_after", report.head_bytes_after)?;
-    dict.set_item("num_quantized_backbone", report.num_quantized_backbone)?;
-    dict.set_item("backbone_bytes_before", report.backbone_bytes_before)?;
-    dict.set_item("backbone_bytes_after", report.backbone_bytes_after)?;
-    dict.set_item("backbone_copied", report.backbone_copied)?;
+    let dict = written_dict(py, &report.written)?;
+    set_fields!(dict, report;
+        num_quantized num_copied head_bytes_before head_bytes_after num_quantized_backbone
+        backbone_bytes_before backbone_bytes_after backbone_copied);
     Ok(dict)
 }
 
@@ -96,10 +88,10 @@ pub(crate) fn convert<'py>(
     py: Python<'py>,
     rewrite: PyRewrite,
     embodiment_ids: Option<Vec<i64>>,
-    dtype: Option<String>,
+    dtype: Option<Named<Float>>,
     adapter: Option<PathBuf>,
 ) -> PyResult<Bound<'py, PyDict>> {
-    let dtype = dtype.map(|name| name.parse()).transpose().map_err(raise)?;
+    let dtype = dtype.map(|given| given.0);
     let report = rewrite.run(py, |source, out, rewrite, progress| {
         let options = ConvertOptions {
             rewrite,
@@ -109,18 +101,10 @@ pub(crate) fn convert<'py>(
         };
         saccade_vla::convert(source, out, &options, progress)
     })?;
-    let dict = written_dict(py, report.written)?;
-    dict.set_item("num_merged", report.num_merged)?;
-    dict.set_item("num_replaced", report.num_replaced)?;
-    dict.set_item("num_converted", report.num_converted)?;
-    dict.set_item("num_rounded", report.num_rounded)?;
-    dict.set_item("largest_error", report.largest_error)?;
-    dict.set_item("largest_error_in", report.largest_error_in)?;
-    dict.set_item("largest_relative_error", report.largest_relative_error)?;
-    dict.set_item("embodiment_ids", report.embodiment_ids)?;
-    dict.set_item("zeroed_bytes", report.zeroed_bytes)?;
-    dict.set_item("bytes_before", report.bytes_before)?;
-    dict.set_item("bytes_after", report.bytes_after)?;
+    let dict = written_dict(py, &report.written)?;
+    set_fields!(dict, report;
+        num_merged num_replaced num_converted num_rounded largest_error largest_error_in
+        largest_relative_error embodiment_ids zeroed_bytes bytes_before bytes_after);
     Ok(dict)
 }
 
@@ -141,14 +125,9 @@ pub(crate) fn resize<'py>(
         };
         saccade_vla::resize(source, out, &options, progress)
     })?;
-    let dict = written_dict(py, report.written)?;
-    dict.set_item("num_before", report.num_before)?;
-    dict.set_item("num_after", report.num_after)?;
-    dict.set_item("sources", report.sources)?;
-    dict.set_item("future_key_bias", report.future_key_bias)?;
-    dict.set_item("is_exact", report.is_exact)?;
-    dict.set_item("is_widened", report.is_widened)?;
-    dict.set_item("perturbation_rms", report.perturbation_rms)?;
+    let dict = written_dict(py, &report.written)?;
+    set_fields!(dict, report;
+        num_before num_after sources future_key_bias is_exact is_widened perturbation_rms);
     Ok(dict)
 }
 

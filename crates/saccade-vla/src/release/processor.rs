@@ -1,5 +1,7 @@
 //! The rules of a release's processor: prompt, views, and the files that its options are in.
 
+use std::str::FromStr;
+
 use saccade_vla_kernels::WeightRounding;
 
 use crate::error::{Error, Result, problem};
@@ -190,17 +192,17 @@ impl Preprocessing {
             Self::Isaac => "isaac",
         }
     }
+}
 
-    /// The one that goes by this name.
-    ///
-    /// # Errors
-    /// [`Error::Input`] if there is none.
-    pub fn named(name: &str) -> Result<Self> {
-        [Self::Lerobot, Self::Isaac]
+impl FromStr for Preprocessing {
+    type Err = Error;
+
+    fn from_str(name: &str) -> Result<Self> {
+        let known = [Self::Lerobot, Self::Isaac]
             .into_iter()
-            .find(|one| one.name() == name)
-            .ok_or_else(|| {
-                Error::Input(problem!("preprocessing"; expected "\"lerobot\" or \"isaac\""; got "{name:?}"))
-            })
+            .find(|one| one.name() == name);
+        known.ok_or_else(|| {
+            Error::Input(problem!("preprocessing"; expected "\"lerobot\" or \"isaac\""; got "{name:?}"))
+        })
     }
 }
