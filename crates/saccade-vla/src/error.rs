@@ -78,6 +78,14 @@ pub enum ErrorKind {
 }
 
 impl Error {
+    /// The error of text, called `what`, that is not the JSON which is expected.
+    pub(crate) fn json(what: impl Into<String>, source: serde_json::Error) -> Self {
+        Self::Json {
+            what: what.into(),
+            source: source.into(),
+        }
+    }
+
     /// The error of the text in the file `path`: one that names what is not JSON names the file too.
     pub(crate) fn in_file(self, path: &Path) -> Self {
         match self {

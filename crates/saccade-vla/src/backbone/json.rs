@@ -6,15 +6,9 @@ use serde_json::{Map, Value};
 
 use super::config::{BackboneConfig, CHANNELS, LanguageConfig, Tower, VisionConfig};
 use super::consistency::contradictions;
-use crate::config::Object;
+use crate::config::{MAX_LAYERS, MAX_SIZE, Object, Problems, config_object, whole_numbers};
 use crate::error::{Error, Problem, Result, problem};
 use crate::release::{BackboneRules, TowerKind, Version};
-
-/// No size in a config is larger: products of three of them stay far below `u64::MAX`.
-const MAX_SIZE: u64 = 1 << 20;
-
-/// No tower or language model has more layers; the names of their tensors are written out.
-const MAX_LAYERS: u64 = 1024;
 
 /// The key of the backbone's config in a whole checkpoint's.
 const BACKBONE_KEY: &str = "backbone_cfg";
@@ -33,16 +27,7 @@ impl GivenConfig {
     /// [`Error::Json`] for text that is not JSON; [`Error::Checkpoint`] if it is no object.
     pub(crate) fn parse(text: &str) -> Result<Self> {
         let bad = |problem: String| Err(Error::Checkpoint(Problem::new("config", problem)));
-        let top = match serde_json::from_str(text) {
-            Ok(Value::Object(top)) => top,
-            Ok(_) => return bad("expected a JSON object".to_owned()),
-            Err(source) => {
-                return Err(Error::Json {
-                    what: "config".to_owned(),
-                    source: source.into(),
-                });
-            }
-        };
+        let top = config_object(text)?;
         let mut backbone = match top.get(BACKBONE_KEY) {
             Some(Value::Object(backbone)) => backbone.clone(),
             None | Some(Value::Null) => Map::new(),
@@ -95,15 +80,10 @@ impl GivenConfig {
         let mut reader = Reader {
             given: self,
             released,
-            problems: Vec::new(),
+            problems: Problems::default(),
         };
         let config = reader.config(version, rules);
-        if reader.problems.is_empty() {
-            return Ok(config);
-        }
-        Err(Error::Checkpoint(problem!(
-            "config"; "{}", reader.problems.join("; ")
-        )))
+        reader.problems.finish(config, contradictions)
     }
 }
 
@@ -132,13 +112,17 @@ impl Section {
             Self::Tokens => "token_ids",
         }
     }
+
+    fn path(self, key: &str) -> String {
+        format!("{}.{key}", self.key())
+    }
 }
 
 /// Reads keys and collects all problems, so that one error lists everything.
 struct Reader<'a> {
     given: &'a GivenConfig,
     released: Object,
-    problems: Vec<String>,
+    problems: Problems,
 }
 
 impl Reader<'_> {
@@ -146,22 +130,18 @@ impl Reader<'_> {
         for section in [Section::Vision, Section::Text, Section::Eagle, Section::Tokens] {
             let key = section.key();
             if self.given.sizes.get(key).is_some_and(|value| !value.is_object()) {
-                self.problems.push(format!("{key}: expected an object"));
+                self.problems.add(format!("{key}: expected an object"));
             }
         }
         let vision = self.vision(rules);
         let language = self.language(rules);
-        let config = BackboneConfig {
+        BackboneConfig {
             version,
             project_to_dim: self.project_to_dim(),
             image_token_id: self.image_token_id(rules),
             vision,
             language,
-        };
-        if self.problems.is_empty() {
-            self.problems = contradictions(&config);
         }
-        config
     }
 
     fn vision(&mut self, rules: &BackboneRules) -> VisionConfig {
@@ -170,11 +150,11 @@ impl Reader<'_> {
             TowerKind::Siglip { .. } => ["num_hidden_layers", "num_attention_heads"],
             TowerKind::Qwen3Vl => ["depth", "num_heads"],
         };
-        self.expect(Vision, "hidden_act", &["gelu_pytorch_tanh"].map(Value::from));
+        self.expect(Vision, "hidden_act", "gelu_pytorch_tanh");
         for key in ["num_channels", "in_channels"] {
-            self.expect(Vision, key, &[Value::from(CHANNELS)]);
+            self.expect(Vision, key, CHANNELS);
         }
-        self.expect(Vision, "use_rope", &[Value::from(false)]);
+        self.expect(Vision, "use_rope", false);
         let (width, num_heads) = (self.size(Vision, "hidden_size"), self.size(Vision, heads));
         let patch_size = self.size(Vision, "patch_size");
         let mut config = VisionConfig {
@@ -211,7 +191,7 @@ impl Reader<'_> {
                     config.num_positions = self.size(Vision, "num_patches");
                 }
                 if self.flag(Eagle, "use_pixel_shuffle") {
-                    self.expect(Eagle, "downsample_ratio", &[Value::from(0.5)]);
+                    self.expect(Eagle, "downsample_ratio", 0.5);
                     config.merge = 2;
                 }
                 config.connector_layers = self.within(Eagle, "mlp_connector_layers", 1..=2);
@@ -233,15 +213,15 @@ impl Reader<'_> {
 
     fn language(&mut self, rules: &BackboneRules) -> LanguageConfig {
         use Section::Text;
-        self.expect(Text, "hidden_act", &["silu"].map(Value::from));
-        self.expect(Text, "attention_bias", &[Value::from(false)]);
-        self.expect(Text, "use_sliding_window", &[Value::from(false)]);
+        self.expect(Text, "hidden_act", "silu");
+        self.expect(Text, "attention_bias", false);
+        self.expect(Text, "use_sliding_window", false);
         let mrope_section = match self.value(Text, "rope_scaling") {
             Some(Value::Object(scaling)) => self.mrope_section(&scaling),
             None | Some(Value::Null) => None,
             Some(_) => {
                 self.problems
-                    .push("text_config.rope_scaling: expected an object or null".to_owned());
+                    .add("text_config.rope_scaling: expected an object or null".to_owned());
                 None
             }
         };
@@ -270,7 +250,8 @@ impl Reader<'_> {
             .find(|value| !value.as_f64().is_some_and(|layer| layer < 0.0))
             .or_else(|| self.released.get("select_layer"))
             .cloned();
-        self.whole("select_layer", found.as_ref(), 1..=MAX_LAYERS)
+        self.problems
+            .whole("select_layer", found.as_ref(), 1..=MAX_LAYERS)
     }
 
     /// That the vision tower's last layer is taken.
@@ -285,9 +266,8 @@ impl Reader<'_> {
         if let Some(layer) = eagle.or(of_vision)
             && layer.as_i64() != Some(-1)
         {
-            self.problems.push(format!(
-                "eagle.select_layer is {layer}, expected -1, the last layer of the vision tower"
-            ));
+            let expected = "-1, the last layer of the vision tower";
+            self.problems.differs("eagle.select_layer", Some(layer), expected);
         }
     }
 
@@ -297,7 +277,7 @@ impl Reader<'_> {
             .into_iter()
             .find_map(|object| object.get("project_to_dim"))
             .filter(|value| !value.is_null())?;
-        Some(self.whole("project_to_dim", Some(found), 1..=MAX_SIZE))
+        Some(self.problems.whole("project_to_dim", Some(found), 1..=MAX_SIZE))
     }
 
     fn image_token_id(&mut self, rules: &BackboneRules) -> usize {
@@ -312,21 +292,17 @@ impl Reader<'_> {
     fn mrope_section(&mut self, scaling: &Object) -> Option<[usize; 3]> {
         let is_known = scaling.get("mrope_interleaved") == Some(&Value::Bool(true))
             && scaling.get("rope_type").is_none_or(|kind| kind == "default");
-        let section = scaling.get("mrope_section").and_then(Value::as_array);
-        let section: Option<Vec<usize>> = section.and_then(|section| {
-            let size = |value: &Value| value.as_u64().filter(|size| *size <= MAX_SIZE);
-            section
-                .iter()
-                .map(|value| size(value).map(|size| size as usize))
-                .collect()
-        });
-        match section.as_deref() {
-            Some(&[time, height, width]) if is_known => return Some([time, height, width]),
-            _ => self.problems.push(format!(
-                "text_config.rope_scaling is {}, expected interleaved mrope with a mrope_section of three numbers",
-                Value::Object(scaling.clone())
-            )),
+        let section = scaling.get("mrope_section").and_then(whole_numbers);
+        if let Some(&[time, height, width]) = section.as_deref()
+            && is_known
+        {
+            return Some([time, height, width]);
         }
+        self.problems.differs(
+            "text_config.rope_scaling",
+            Some(&Value::Object(scaling.clone())),
+            "interleaved mrope with a mrope_section of three numbers",
+        );
         None
     }
 
@@ -342,16 +318,11 @@ impl Reader<'_> {
     }
 
     /// A key that may be absent, but if present must have a value that the released code was run with.
-    fn expect(&mut self, section: Section, key: &str, expected: &[Value]) {
-        if let Some(value) = self.value(section, key)
-            && !expected.contains(&value)
-        {
-            let expected = expected.iter().map(Value::to_string).collect::<Vec<_>>();
-            self.problems.push(format!(
-                "{}.{key} is {value}, expected {}",
-                section.key(),
-                expected.join(" or ")
-            ));
+    fn expect(&mut self, section: Section, key: &str, expected: impl Into<Value>) {
+        let (given, expected) = (self.value(section, key), expected.into());
+        if given.as_ref().is_some_and(|given| *given != expected) {
+            self.problems
+                .differs(&section.path(key), given.as_ref(), &expected.to_string());
         }
     }
 
@@ -360,71 +331,27 @@ impl Reader<'_> {
     }
 
     fn within(&mut self, section: Section, key: &str, sizes: RangeInclusive<u64>) -> usize {
-        let value = self.value(section, key);
-        self.whole(&format!("{}.{key}", section.key()), value.as_ref(), sizes)
-    }
-
-    fn whole(&mut self, path: &str, value: Option<&Value>, sizes: RangeInclusive<u64>) -> usize {
-        let problem = match value {
-            None => format!("{path} is missing"),
-            Some(value) => match value.as_u64() {
-                Some(size) if sizes.contains(&size) => return size as usize,
-                _ => format!(
-                    "{path} is {value}, expected a whole number from {} to {}",
-                    sizes.start(),
-                    sizes.end()
-                ),
-            },
-        };
-        self.problems.push(problem);
-        1
+        let given = self.value(section, key);
+        self.problems.whole(&section.path(key), given.as_ref(), sizes)
     }
 
     fn sizes(&mut self, section: Section, key: &str) -> Vec<usize> {
-        let value = self.value(section, key);
-        let sizes: Option<Vec<usize>> = value.as_ref().and_then(Value::as_array).and_then(|sizes| {
-            let size = |value: &Value| value.as_u64().filter(|size| *size <= MAX_SIZE);
-            sizes
-                .iter()
-                .map(|value| size(value).map(|size| size as usize))
-                .collect()
-        });
-        sizes.unwrap_or_else(|| {
-            self.problems.push(format!(
-                "{}.{key}: expected a list of whole numbers",
-                section.key()
-            ));
+        let given = self.value(section, key);
+        given.as_ref().and_then(whole_numbers).unwrap_or_else(|| {
+            let path = section.path(key);
+            self.problems
+                .add(format!("{path}: expected a list of whole numbers"));
             Vec::new()
         })
     }
 
-    /// A positive number.
     fn number(&mut self, section: Section, key: &str) -> f64 {
-        let value = self.value(section, key);
-        match value.as_ref().and_then(Value::as_f64) {
-            Some(number) if number > 0.0 && number.is_finite() => number,
-            _ => {
-                let shown = value.map_or("missing".to_owned(), |value| value.to_string());
-                self.problems.push(format!(
-                    "{}.{key} is {shown}, expected a positive number",
-                    section.key()
-                ));
-                1.0
-            }
-        }
+        let given = self.value(section, key);
+        self.problems.positive(&section.path(key), given.as_ref())
     }
 
     fn flag(&mut self, section: Section, key: &str) -> bool {
-        match self.value(section, key) {
-            Some(Value::Bool(flag)) => flag,
-            other => {
-                let shown = other.map_or("missing".to_owned(), |value| value.to_string());
-                self.problems.push(format!(
-                    "{}.{key} is {shown}, expected true or false",
-                    section.key()
-                ));
-                false
-            }
-        }
+        let given = self.value(section, key);
+        self.problems.flag(&section.path(key), given.as_ref())
     }
 }

@@ -1,12 +1,10 @@
 //! A config as it is given: the whole object, the head's in it, and the version that it declares.
 
-use serde_json::{Map, Value};
+use serde_json::Value;
 
+use super::values::{Object, config_object};
 use crate::error::{Error, Problem, Result};
 use crate::release::Version;
-
-/// A JSON object.
-pub(crate) type Object = Map<String, Value>;
 
 /// The key of the head's config in a whole checkpoint's.
 pub(crate) const HEAD_KEY: &str = "action_head_cfg";
@@ -34,17 +32,13 @@ impl CheckpointConfig {
     /// [`Error::Json`] for text that is not JSON; [`Error::Checkpoint`] if it is no object, and if the head's
     /// config in it is none or has saccade's key next to it.
     pub(crate) fn parse(text: &str) -> Result<Self> {
+        Self::of(config_object(text)?)
+    }
+
+    /// # Errors
+    /// [`Error::Checkpoint`] as for [`CheckpointConfig::parse`].
+    pub(crate) fn of(mut top: Object) -> Result<Self> {
         let bad = |problem: String| Err(Error::Checkpoint(Problem::new("config", problem)));
-        let mut top = match serde_json::from_str(text) {
-            Ok(Value::Object(top)) => top,
-            Ok(_) => return bad("expected a JSON object".to_owned()),
-            Err(source) => {
-                return Err(Error::Json {
-                    what: "config".to_owned(),
-                    source: source.into(),
-                });
-            }
-        };
         let nested = match top.remove(HEAD_KEY) {
             None => None,
             Some(Value::Object(head)) => Some(head),

@@ -1,19 +1,17 @@
 //! Contradictions between the sizes and switches of a head's config.
 
-use serde_json::Value;
+use super::head_config::HeadConfig;
+use super::values::MAX_SIZE;
 
-use super::checkpoint_config::Object;
-use super::head_config::{HeadConfig, MAX_SIZE};
-use crate::release::Version;
+/// Sizes that a config may say although others determine them.
+pub(super) struct SizesSaidTwice {
+    pub cross_attention_dim: Option<usize>,
+    pub output_dim: Option<usize>,
+    pub action_dim: Option<usize>,
+}
 
-/// Everything in a head's config that contradicts itself. `head` and `dit` are the objects that it was read
-/// from.
-pub(super) fn contradictions(
-    version: Version,
-    config: &HeadConfig,
-    head: &Object,
-    dit: &Object,
-) -> Vec<String> {
+/// Everything in a head's config that contradicts itself, or what it says `twice`.
+pub(super) fn contradictions(config: &HeadConfig, twice: &SizesSaidTwice) -> Vec<String> {
     let mut problems = Vec::new();
     let mut equal = |what: &str, given: usize, other: &str, expected: usize| {
         if given != expected {
@@ -34,15 +32,11 @@ pub(super) fn contradictions(
             config.vl_num_heads * config.vl_head_dim,
         );
     }
-    let number = |map: &Object, key: &str| {
-        let number = map.get(key).and_then(Value::as_u64);
-        number.map(|number| usize::try_from(number).unwrap_or(usize::MAX))
-    };
     let cross = "diffusion_model_cfg.cross_attention_dim";
-    match number(dit, "cross_attention_dim") {
+    match twice.cross_attention_dim {
         Some(given) => equal(cross, given, "backbone_embedding_dim", config.context_dim),
         // Null means the width; flat configs give their class `backbone_embedding_dim` instead.
-        None if !version.is_flat() => equal(
+        None if !config.version.is_flat() => equal(
             &format!("{cross} (null, so input_embedding_dim)"),
             config.width,
             "backbone_embedding_dim",
@@ -50,7 +44,7 @@ pub(super) fn contradictions(
         ),
         None => {}
     }
-    if let Some(output) = number(dit, "output_dim") {
+    if let Some(output) = twice.output_dim {
         equal(
             "diffusion_model_cfg.output_dim",
             output,
@@ -58,8 +52,8 @@ pub(super) fn contradictions(
             config.hidden_dim,
         );
     }
-    if version.is_flat()
-        && let Some(action_dim) = number(head, "action_dim")
+    if config.version.is_flat()
+        && let Some(action_dim) = twice.action_dim
     {
         equal("action_dim", action_dim, "max_action_dim", config.action_dim);
     }

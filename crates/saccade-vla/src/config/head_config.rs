@@ -3,6 +3,7 @@
 //! The keys in JSON are the released ones (`input_embedding_dim`, `num_target_vision_tokens`); the fields of
 //! [`HeadConfig`] have the names that are used everywhere else.
 
+use super::values::MAX_SIZE;
 use crate::error::{Error, Result, problem};
 use crate::release::{Feature, Version};
 
@@ -168,6 +169,3 @@ impl HeadConfig {
         })
     }
 }
-
-/// No size in a config is larger: products of three of them stay far below `u64::MAX`.
-pub(super) const MAX_SIZE: u64 = 1 << 20;

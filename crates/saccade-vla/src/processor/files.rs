@@ -2,12 +2,11 @@
 
 use std::path::Path;
 
-use saccade_vla_checkpoint::read_text;
 use serde_json::{Value, json};
 
-use super::options::{asks_for_nothing, is_read};
+use super::options::is_read;
 use super::settings::{LEROBOT_CROP, LEROBOT_TARGET};
-use crate::config::Object;
+use crate::config::{Object, asks_for_nothing, object_in_any};
 use crate::error::{Error, Result, problem};
 use crate::release::{IsaacFile, LerobotRules, PIXEL_LIMITS, Preprocessing, ProcessorRules, Version};
 
@@ -53,7 +52,7 @@ pub(super) fn options(
 /// # Errors
 /// [`Error::Checkpoint`] and [`Error::Json`] for a file that is broken.
 pub(super) fn add_pixel_limits(options: &mut Object, folder: &Path) -> Result<()> {
-    let Some(file) = read_object("source", &folder.join(PIXEL_LIMITS))? else {
+    let Some(file) = object_in_any("source", &folder.join(PIXEL_LIMITS))? else {
         return Ok(());
     };
     for (key, value) in file {
@@ -87,7 +86,7 @@ fn processor_kwargs(
     let is_argument = |key: &str| released.arguments.iter().any(|keys| keys.contains(&key));
     for folder in ["", "processor"] {
         let path = directory.join(folder).join(PROCESSOR);
-        let Some(mut file) = read_object("source", &path)? else {
+        let Some(mut file) = object_in_any("source", &path)? else {
             continue;
         };
         let mut kwargs = match file.remove("processor_kwargs") {
@@ -121,7 +120,7 @@ fn lerobot_steps(
     directory: &Path,
 ) -> Result<Object> {
     let path = directory.join(PIPELINE);
-    let steps = match read_object("source", &path)?.map(|mut file| file.remove("steps")) {
+    let steps = match object_in_any("source", &path)?.map(|mut file| file.remove("steps")) {
         None if rules.has_view_sizes => {
             return Ok(as_lerobot_writes(
                 processor_kwargs(version, file, directory)?.unwrap_or_default(),
@@ -215,26 +214,5 @@ fn object(value: Value) -> Object {
     match value {
         Value::Object(keys) => keys,
         _ => Object::new(),
-    }
-}
-
-/// The object in a JSON file, if the file is there.
-///
-/// # Errors
-/// [`Error::File`], [`Error::Json`] and [`Error::Checkpoint`] for a file that is no such thing.
-pub(super) fn read_object(what: &'static str, path: &Path) -> Result<Option<Object>> {
-    if !path.exists() {
-        return Ok(None);
-    }
-    let text = read_text(what, path)?;
-    match serde_json::from_str(&text) {
-        Ok(Value::Object(keys)) => Ok(Some(keys)),
-        Ok(_) => Err(Error::Checkpoint(problem!(
-            what; "{}: expected a JSON object", path.display()
-        ))),
-        Err(source) => Err(Error::Json {
-            what: format!("{what}: {}", path.display()),
-            source: source.into(),
-        }),
     }
 }

@@ -2,7 +2,7 @@
 
 use serde_json::Value;
 
-use crate::config::Object;
+use crate::config::{Object, asks_for_nothing};
 use crate::error::{Error, Problem, Result, problem};
 use crate::release::{Pixels, Version, ViewRules};
 
@@ -97,17 +97,6 @@ pub(super) fn is_read(views: &ViewRules, key: &str) -> bool {
     READ.contains(&key) && (matches!(views, ViewRules::Flexible(_)) || key == "formalize_language")
 }
 
-/// Whether a value asks for nothing: null, false, or empty.
-pub(super) fn asks_for_nothing(value: &Value) -> bool {
-    match value {
-        Value::Null | Value::Bool(false) => true,
-        Value::String(text) => text.is_empty(),
-        Value::Array(values) => values.is_empty(),
-        Value::Object(keys) => keys.is_empty(),
-        _ => false,
-    }
-}
-
 /// The keys that replace those of a checkpoint.
 ///
 /// # Errors
@@ -152,12 +141,7 @@ impl Options {
             Ok(None) => Object::new(),
             Ok(Some(Value::Object(keys))) => keys,
             Ok(Some(_)) => return Err(Error::Input(Problem::new("options", "expected a JSON object"))),
-            Err(source) => {
-                return Err(Error::Json {
-                    what: "options".to_owned(),
-                    source: source.into(),
-                });
-            }
+            Err(source) => return Err(Error::json("options", source)),
         };
         let mut problems = Vec::new();
         match keys.remove("processor_kwargs") {

@@ -5,13 +5,13 @@ use std::path::{Path, PathBuf};
 use saccade_vla_checkpoint::Checkpoint;
 use serde_json::Value;
 
-use super::files::{add_pixel_limits, options, read_object};
+use super::files::{add_pixel_limits, options};
 use super::options::overrides;
 use super::settings::ProcessorOptions;
 use super::tokenizer::TokenizerFiles;
 use super::{Processor, Tokenizer};
 use crate::backbone::backbones_in;
-use crate::config::{CheckpointConfig, Object};
+use crate::config::{CheckpointConfig, Object, object_in_any};
 use crate::error::{Error, Result, problem, show_shape};
 use crate::recognise::HeadCheckpoint;
 use crate::release::{Names, Preprocessing, ProcessorRules, Version, ViewRules};
@@ -40,10 +40,8 @@ impl ProcessorSource {
             true => source,
             false => source.parent().unwrap_or(Path::new("")),
         };
-        let config = match read_object("config", &directory.join("config.json"))? {
-            None => None,
-            Some(config) => Some(CheckpointConfig::parse(&Value::Object(config).to_string())?),
-        };
+        let config = object_in_any("config", &directory.join("config.json"))?;
+        let config = config.map(CheckpointConfig::of).transpose()?;
         let found = {
             let names: Vec<&str> = checkpoint.names().collect();
             backbones_in(names.into_iter()).into_iter().next()

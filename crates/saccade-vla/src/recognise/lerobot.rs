@@ -1,22 +1,20 @@
 //! lerobot's checkpoints, whose `config.json` describes a policy and holds no size of the head. Sizes come
 //! from the tensors; what no shape determines is taken from the published models.
 
-use std::path::Path;
-
-use saccade_vla_checkpoint::{OWN_CONFIG, read_text};
+use saccade_vla_checkpoint::OWN_CONFIG;
 use serde_json::{Map, Value, json};
 
 use super::layout::{CheckpointLayout, Contents, Evidence};
 use super::sizes::{self, BLOCKS, FUTURE_TOKENS, HeadShapes, add_decoders, proved};
-use crate::config::{CheckpointConfig, OWN_KEY, Object};
+use crate::config::{CheckpointConfig, OWN_KEY, Object, object_in_any};
 use crate::error::{Error, Result, problem};
 use crate::release::{Feature, Version};
 
 /// lerobot's: everything under `_groot_model.`, the policy's `config.json`.
-pub(super) struct Lerobot;
-
-/// lerobot's, of a fork with several action decoders.
-pub(super) struct Fork;
+pub(super) struct Lerobot {
+    /// Whether it is that of a fork, with several action decoders.
+    pub is_fork: bool,
+}
 
 const PREFIX: &str = "_groot_model.action_head.";
 
@@ -25,7 +23,7 @@ const POLICY: &str = "groot";
 
 impl CheckpointLayout for Lerobot {
     fn name(&self) -> &'static str {
-        "lerobot"
+        if self.is_fork { "fork" } else { "lerobot" }
     }
 
     fn prefix(&self) -> Option<&'static str> {
@@ -33,7 +31,10 @@ impl CheckpointLayout for Lerobot {
     }
 
     fn matches(&self, contents: &Contents<'_>) -> bool {
-        contents.tensors.prefix == PREFIX || contents.config.top().contains_key("type")
+        match self.is_fork {
+            true => contents.tensors.has_several_decoders(),
+            false => contents.tensors.prefix == PREFIX || contents.config.top().contains_key("type"),
+        }
     }
 
     fn is_without_head(&self, config: &CheckpointConfig) -> Result<bool> {
@@ -76,32 +77,11 @@ impl CheckpointLayout for Lerobot {
             ));
         }
         let mut head = from_tensors(contents.config.top(), version, &contents.tensors)?;
-        if let Some(own) = own_config(contents.directory)? {
-            head.insert(OWN_KEY.to_owned(), own);
+        // lerobot refuses a `config.json` with keys that it does not know.
+        if let Some(own) = object_in_any("source", &contents.directory.join(OWN_CONFIG))? {
+            head.insert(OWN_KEY.to_owned(), Value::Object(own));
         }
         Ok((head, Vec::new()))
-    }
-}
-
-impl CheckpointLayout for Fork {
-    fn name(&self) -> &'static str {
-        "fork"
-    }
-
-    fn prefix(&self) -> Option<&'static str> {
-        Lerobot.prefix()
-    }
-
-    fn matches(&self, contents: &Contents<'_>) -> bool {
-        contents.tensors.has_several_decoders()
-    }
-
-    fn add_evidence(&self, contents: &Contents<'_>, found: &mut Vec<Evidence>) {
-        Lerobot.add_evidence(contents, found);
-    }
-
-    fn head_config(&self, contents: &Contents<'_>, version: Version) -> Result<(Object, Vec<String>)> {
-        Lerobot.head_config(contents, version)
     }
 }
 
@@ -258,23 +238,4 @@ fn widened(version: Version, dim: u64, default: u64) -> u64 {
         .as_ref()
         .and_then(|lerobot| lerobot.padded_to);
     padded_to.filter(|_| dim == default).unwrap_or(dim)
-}
-
-/// Saccade's own part of the head's config: in a separate file, since lerobot refuses a `config.json` with
-/// keys that it does not know.
-fn own_config(directory: &Path) -> Result<Option<Value>> {
-    let path = directory.join(OWN_CONFIG);
-    if !path.exists() {
-        return Ok(None);
-    }
-    let own = serde_json::from_str(&read_text("source", &path)?).map_err(|source| Error::Json {
-        what: format!("source: {}", path.display()),
-        source: source.into(),
-    })?;
-    match own {
-        Value::Object(_) => Ok(Some(own)),
-        _ => Err(Error::Checkpoint(problem!(
-            "source"; "{}: expected a JSON object", path.display()
-        ))),
-    }
 }

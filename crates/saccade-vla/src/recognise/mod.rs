@@ -21,7 +21,7 @@ use crate::error::{Error, Result, problem};
 use evidence::recognise_version;
 pub(crate) use layout::BACKBONE_PREFIXES;
 use layout::{CheckpointLayout, Contents};
-use lerobot::{Fork, Lerobot};
+use lerobot::Lerobot;
 use nvidia::{IsaacFineTune, Nvidia, Own};
 use sizes::HeadShapes;
 
@@ -147,7 +147,13 @@ pub struct TensorFacts {
 }
 
 /// Every layout. The first one that a checkpoint has is its own; the last one fits all.
-static LAYOUTS: [&dyn CheckpointLayout; 5] = [&Fork, &Lerobot, &Own, &IsaacFineTune, &Nvidia];
+static LAYOUTS: [&dyn CheckpointLayout; 5] = [
+    &Lerobot { is_fork: true },
+    &Lerobot { is_fork: false },
+    &Own,
+    &IsaacFineTune,
+    &Nvidia,
+];
 
 /// The layout of a checkpoint.
 fn layout_of(contents: &Contents<'_>) -> &'static dyn CheckpointLayout {

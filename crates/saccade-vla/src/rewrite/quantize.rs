@@ -17,7 +17,7 @@ use crate::rewrite::float::Float;
 use crate::rewrite::{RewriteOptions, SourceCheckpoint, Written};
 
 /// What [`quantize`] wrote.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, Default)]
 pub struct QuantizeReport {
     /// The files.
     pub written: Written,
@@ -87,15 +87,8 @@ pub fn quantize(
     }
     let mut planned = Vec::new();
     let mut report = QuantizeReport {
-        written: Written::default(),
-        num_quantized: 0,
-        num_copied: 0,
-        head_bytes_before: 0,
-        head_bytes_after: 0,
-        num_quantized_backbone: 0,
-        backbone_bytes_before: 0,
-        backbone_bytes_after: 0,
         backbone_copied: backbone.as_ref().err().cloned(),
+        ..QuantizeReport::default()
     };
     for name in source.names(options) {
         let mut tensors = vec![source.as_it_is(name)?];

@@ -23,17 +23,8 @@ struct File {
 #[derive(serde::Deserialize)]
 struct FileAdded {
     id: u32,
-    content: String,
-    #[serde(default)]
-    single_word: bool,
-    #[serde(default)]
-    lstrip: bool,
-    #[serde(default)]
-    rstrip: bool,
-    #[serde(default)]
-    normalized: bool,
-    #[serde(default)]
-    special: bool,
+    #[serde(flatten)]
+    token: Added,
 }
 
 #[derive(serde::Deserialize)]
@@ -95,22 +86,11 @@ impl<'de> Deserialize<'de> for Merge {
 /// # Errors
 /// [`Error::Json`] for text that is not JSON or has other types; [`Error::Checkpoint`] that lists everything in which it differs from Qwen2's.
 pub(super) fn parse(text: &str) -> Result<Parts> {
-    let file: File = serde_json::from_str(text).map_err(|source| Error::Json {
-        what: "tokenizer".to_owned(),
-        source: source.into(),
-    })?;
+    let file: File = serde_json::from_str(text).map_err(|source| Error::json("tokenizer", source))?;
     let mut problems = Problems::default();
     check_kind(&file, &mut problems);
     problems.into_result()?;
-    let added = file.added_tokens.into_iter().map(|token| Added {
-        id: token.id,
-        content: token.content,
-        special: token.special,
-        single_word: token.single_word,
-        lstrip: token.lstrip,
-        rstrip: token.rstrip,
-        normalized: token.normalized,
-    });
+    let added = file.added_tokens.into_iter();
     Ok(Parts {
         vocab: file.model.vocab.0,
         merges: file
@@ -119,7 +99,7 @@ pub(super) fn parse(text: &str) -> Result<Parts> {
             .into_iter()
             .map(|merge| (merge.0, merge.1))
             .collect(),
-        added: added.collect(),
+        added: added.map(|added| (added.id, added.token)).collect(),
     })
 }
 

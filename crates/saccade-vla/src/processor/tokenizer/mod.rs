@@ -97,7 +97,7 @@ impl Tokenizer {
             added,
         } = parts;
         // Added tokens are in the vocabulary too, so that they keep the ids of the file: the crate numbers others in their order.
-        vocab.extend(added.iter().map(|token| (token.content.clone(), token.id)));
+        vocab.extend(added.iter().map(|(id, token)| (token.content.clone(), *id)));
         let bpe = BPE::builder().vocab_and_merges(vocab, merges).build();
         let bpe = bpe.map_err(|problem| Error::Checkpoint(problem!("tokenizer"; "merges: {problem}")))?;
         let split = Split::new(
@@ -114,7 +114,7 @@ impl Tokenizer {
         ])));
         let added: Vec<AddedToken> = added
             .into_iter()
-            .map(|token| {
+            .map(|(_, token)| {
                 AddedToken::from(token.content, token.special)
                     .single_word(token.single_word)
                     .lstrip(token.lstrip)

@@ -19,28 +19,28 @@ const MAX_PROBLEMS: usize = 20;
 pub(super) const PATTERN: &str = r"(?i:'s|'t|'re|'ve|'m|'ll|'d)|[^\r\n\p{L}\p{N}]?\p{L}+|\p{N}| ?[^\s\p{L}\p{N}]+[\r\n]*|\s*[\r\n]+|\s+(?!\S)|\s+";
 
 /// A token that is found in text before anything else.
-#[derive(Clone, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, Default, PartialEq, Eq, serde::Deserialize)]
 pub(super) struct Added {
-    pub id: u32,
     pub content: String,
+    #[serde(default)]
     pub special: bool,
+    #[serde(default)]
     pub single_word: bool,
+    #[serde(default)]
     pub lstrip: bool,
+    #[serde(default)]
     pub rstrip: bool,
+    #[serde(default)]
     pub normalized: bool,
 }
 
 impl Added {
     /// A token that is matched as it stands.
-    pub(super) fn plain(id: u32, content: String) -> Self {
+    pub(super) fn plain(content: String) -> Self {
         Self {
-            id,
             content,
             special: true,
-            single_word: false,
-            lstrip: false,
-            rstrip: false,
-            normalized: false,
+            ..Self::default()
         }
     }
 }
@@ -50,7 +50,8 @@ impl Added {
 pub(super) struct Parts {
     pub vocab: Vocab,
     pub merges: Merges,
-    pub added: Vec<Added>,
+    /// By their ids.
+    pub added: Vec<(u32, Added)>,
 }
 
 impl Parts {
@@ -59,7 +60,7 @@ impl Parts {
         let added = self
             .added
             .iter()
-            .filter(|token| !self.vocab.contains_key(&token.content));
+            .filter(|(_, token)| !self.vocab.contains_key(&token.content));
         self.vocab.len() + added.count()
     }
 
@@ -78,7 +79,7 @@ impl Parts {
     fn check_ids(&self, problems: &mut Problems) {
         let mut tokens: HashMap<u32, &str> = HashMap::with_capacity(self.vocab.len());
         let mut contents = HashSet::new();
-        let added = self.added.iter().map(|token| (token.content.as_str(), token.id));
+        let added = self.added.iter().map(|(id, token)| (token.content.as_str(), *id));
         let vocab = self.vocab.iter().map(|(token, &id)| (token.as_str(), id));
         for (token, id) in vocab.chain(added) {
             if id >= MAX_ID {
@@ -90,20 +91,18 @@ impl Parts {
                 problems.add(|| format!("{token:?} and {other:?} have the same id, {id}"));
             }
         }
-        for token in &self.added {
+        for (id, token) in &self.added {
             if token.content.is_empty() {
-                problems.add(|| format!("the added token {} is empty", token.id));
+                problems.add(|| format!("the added token {id} is empty"));
             }
             if !contents.insert(&token.content) {
                 problems.add(|| format!("{:?} is added twice", token.content));
             }
-            if let Some(&id) = self.vocab.get(&token.content)
-                && id != token.id
-            {
+            if let Some(known) = self.vocab.get(&token.content).filter(|known| *known != id) {
                 problems.add(|| {
                     format!(
-                        "{:?}: expected the id of the vocabulary, {id}, got {}",
-                        token.content, token.id
+                        "{:?}: expected the id of the vocabulary, {known}, got {id}",
+                        token.content
                     )
                 });
             }

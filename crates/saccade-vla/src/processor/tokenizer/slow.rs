@@ -12,28 +12,13 @@ use crate::error::{Error, Result};
 #[derive(Default, Deserialize)]
 struct Config {
     #[serde(default)]
-    added_tokens_decoder: BTreeMap<String, ConfigAdded>,
+    added_tokens_decoder: BTreeMap<String, Added>,
     #[serde(default)]
     add_prefix_space: Option<bool>,
     #[serde(default)]
     add_bos_token: Option<bool>,
     #[serde(default)]
     add_eos_token: Option<bool>,
-}
-
-#[derive(Deserialize)]
-struct ConfigAdded {
-    content: String,
-    #[serde(default)]
-    lstrip: bool,
-    #[serde(default)]
-    rstrip: bool,
-    #[serde(default)]
-    single_word: bool,
-    #[serde(default)]
-    normalized: bool,
-    #[serde(default)]
-    special: bool,
 }
 
 /// The parts of these files, given as text.
@@ -68,7 +53,7 @@ pub(super) fn parse(
     }
     let mut added: BTreeMap<u32, Added> = by_content
         .into_iter()
-        .map(|(content, id)| (id, Added::plain(id, content)))
+        .map(|(content, id)| (id, Added::plain(content)))
         .collect();
     for (key, token) in config.added_tokens_decoder {
         let Ok(id) = key.parse() else {
@@ -76,38 +61,26 @@ pub(super) fn parse(
                 .add(|| format!("tokenizer_config.json: added_tokens_decoder: expected an id, got {key:?}"));
             continue;
         };
-        let described = Added {
-            id,
-            content: token.content,
-            special: token.special,
-            single_word: token.single_word,
-            lstrip: token.lstrip,
-            rstrip: token.rstrip,
-            normalized: token.normalized,
-        };
-        if let Some(other) = added.get(&id).filter(|other| other.content != described.content) {
+        if let Some(other) = added.get(&id).filter(|other| other.content != token.content) {
             problems.add(|| {
                 format!(
                     "{id} is {:?} in added_tokens.json and {:?} in tokenizer_config.json",
-                    other.content, described.content
+                    other.content, token.content
                 )
             });
         }
-        added.insert(id, described);
+        added.insert(id, token);
     }
     problems.into_result()?;
     Ok(Parts {
         vocab,
         merges,
-        added: added.into_values().collect(),
+        added: added.into_iter().collect(),
     })
 }
 
 fn from_json<'a, T: Deserialize<'a>>(file: &str, text: &'a str) -> Result<T> {
-    serde_json::from_str(text).map_err(|source| Error::Json {
-        what: format!("tokenizer: {file}"),
-        source: source.into(),
-    })
+    serde_json::from_str(text).map_err(|source| Error::json(format!("tokenizer: {file}"), source))
 }
 
 /// The lines of `merges.txt`: two tokens each, after a line that says which version of the format it is.

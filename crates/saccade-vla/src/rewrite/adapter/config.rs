@@ -3,10 +3,10 @@
 use std::path::Path;
 
 use regex::Regex;
-use saccade_vla_checkpoint::{ADAPTER_CONFIG, read_text};
+use saccade_vla_checkpoint::ADAPTER_CONFIG;
 use serde_json::Value;
 
-use crate::config::Object;
+use crate::config::{Object, asks_for_nothing, object_in};
 use crate::error::{Error, Result, problem};
 
 /// Keys without effect on the merged weights: where the base is, how it was trained, how the adapter was drawn.
@@ -94,17 +94,7 @@ impl AdapterConfig {
     /// # Errors
     /// [`Error::File`] if it is not there; [`Error::Checkpoint`] for a config of another rule than plain addition, with the key.
     pub(super) fn read(directory: &Path) -> Result<Self> {
-        let path = directory.join(ADAPTER_CONFIG);
-        let config = match serde_json::from_str(&read_text("adapter", &path)?) {
-            Ok(Value::Object(config)) => config,
-            Ok(_) => return Err(bad("expected a JSON object")),
-            Err(source) => {
-                return Err(Error::Json {
-                    what: format!("adapter: {}", path.display()),
-                    source: source.into(),
-                });
-            }
-        };
+        let config = object_in("adapter", &directory.join(ADAPTER_CONFIG))?;
         check_rule(&config)?;
         let rank = config.get("r").and_then(Value::as_u64).filter(|rank| *rank > 0);
         let targets = names(&config, "target_modules")?;
@@ -198,14 +188,7 @@ fn check_rule(config: &Object) -> Result<()> {
 
 /// Whether a value switches nothing on.
 fn is_unset(value: &Value) -> bool {
-    match value {
-        Value::Null | Value::Bool(false) => true,
-        Value::String(text) => text.is_empty(),
-        Value::Array(values) => values.is_empty(),
-        Value::Object(values) => values.is_empty(),
-        Value::Number(number) => number.as_f64() == Some(0.0),
-        Value::Bool(true) => false,
-    }
+    asks_for_nothing(value) || value.as_f64() == Some(0.0)
 }
 
 fn number(value: Option<&Value>) -> Option<f64> {

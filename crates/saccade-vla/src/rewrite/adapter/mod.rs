@@ -84,10 +84,8 @@ fn own_config(adapter: &Path) -> Result<Option<String>> {
         return Ok(None);
     }
     let text = read_text("adapter", &path)?;
-    let whole: &RawValue = serde_json::from_str(&text).map_err(|source| Error::Json {
-        what: format!("adapter: {}", path.display()),
-        source: source.into(),
-    })?;
+    let whole: &RawValue = serde_json::from_str(&text)
+        .map_err(|source| Error::json(format!("adapter: {}", path.display()), source))?;
     let mut values = Vec::new();
     find("", whole, &mut values)?;
     let switch = values.iter().find(|value| value.path == "use_peft");

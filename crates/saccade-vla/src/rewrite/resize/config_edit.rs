@@ -85,10 +85,7 @@ pub(super) fn config_edit(config: &HeadConfig, given: &str, count: usize) -> Res
         );
     }
     let mut found = Vec::new();
-    let whole: &RawValue = serde_json::from_str(given).map_err(|source| Error::Json {
-        what: "config".to_owned(),
-        source: source.into(),
-    })?;
+    let whole: &RawValue = serde_json::from_str(given).map_err(|source| Error::json("config", source))?;
     find("", whole, &mut found)?;
     let counts: Vec<&Found<'_>> = found.iter().filter(|place| place.key == COUNT_KEY).collect();
     let others: Vec<String> = counts
