@@ -313,56 +313,5 @@ mod tests {
                 proptest::prop_assert_eq!(all, (0..before).collect::<Vec<_>>());
             }
         }
-
-        #[test]
-        fn a_constant_added_to_all_biases_stays_a_constant(
-            before in 2usize..9,
-            seed: u64,
-            // Multiples of 2^-13 up to 2^10 are exact in float32.
-            shift in -1000i16..1000,
-        ) {
-            let mut state = seed;
-            let tokens: Vec<f32> = (0..before * 3).map(|_| uniform(&mut state) as f32 - 0.5).collect();
-            let bias: Vec<f32> = (0..before).map(|_| (uniform(&mut state) * 8192.0) as f32 / 8192.0).collect();
-            let moved: Vec<f32> = bias.iter().map(|bias| bias + f32::from(shift)).collect();
-            let (one, other) = (resized(&tokens, 3, &bias, 1).unwrap(), resized(&tokens, 3, &moved, 1).unwrap());
-            for (one, other) in one.tokens.iter().zip(&other.tokens) {
-                proptest::prop_assert!((one - other).abs() < 1e-4, "{} {}", one, other);
-            }
-            let of = |merged: &MergedTokens| f64::from(merged.key_bias.as_ref().map_or(0.0, |bias| bias[0]));
-            let difference = of(&other) - of(&one);
-            proptest::prop_assert!((difference - f64::from(shift)).abs() < 1e-3, "{} {}", difference, shift);
-        }
-    }
-
-    #[test]
-    fn large_biases_neither_overflow_nor_vanish() {
-        let tokens = [1.0, 0.0, 0.0, 1.0];
-        let merged = |bias: &[f32]| merge_future_tokens(&tokens, 2, 1, Some(bias)).unwrap();
-        let two = merged(&[800.0, 800.0]);
-        assert_eq!(two.tokens, [0.5, 0.5]);
-        assert_eq!(two.key_bias, Some(vec![(800.0 + 2.0f64.ln()) as f32]));
-        let none = merged(&[-1000.0, -1000.0]);
-        assert_eq!(none.key_bias, Some(vec![(-1000.0 + 2.0f64.ln()) as f32]));
-        let one = merged(&[-1000.0, 0.0]);
-        assert_eq!((one.tokens, one.key_bias), (vec![0.0, 1.0], None));
-    }
-
-    #[test]
-    fn arguments_are_checked() {
-        for (tokens, width, count, bias) in [
-            (vec![0.0; 5], 2, 1, None),
-            (vec![0.0; 4], 0, 1, None),
-            (vec![0.0; 4], 2, 3, None),
-            (vec![0.0; 4], 2, 1, Some(vec![0.0; 3])),
-            (vec![f32::NAN; 4], 2, 1, None),
-            (vec![0.0; 4], 2, 1, Some(vec![f32::INFINITY; 2])),
-        ] {
-            assert!(merge_future_tokens(&tokens, width, count, bias.as_deref()).is_err());
-        }
-        assert_eq!(
-            merge_future_tokens(&[], 2, 0, None).unwrap().sources,
-            Vec::<Vec<usize>>::new()
-        );
     }
 }
