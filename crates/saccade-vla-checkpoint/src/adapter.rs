@@ -23,8 +23,9 @@ pub(crate) fn is_adapter(name: &str) -> bool {
     FILES.contains(&name)
 }
 
-/// The directory of a checkpoint, which may be one file.
-pub(crate) fn directory_of(source: &Path) -> &Path {
+/// The directory of the checkpoint `source`, which may be one file.
+#[must_use]
+pub fn directory_of(source: &Path) -> &Path {
     match source.parent() {
         _ if source.is_dir() => source,
         Some(parent) if parent != Path::new("") => parent,

@@ -6,7 +6,7 @@ use std::fs::File;
 use std::io::Read;
 use std::path::{Path, PathBuf};
 
-use crate::adapter::{ADAPTER_CONFIG, is_adapter};
+use crate::adapter::{ADAPTER_CONFIG, directory_of, is_adapter};
 use crate::error::{Error, Result};
 use crate::names::is_processor;
 use crate::source::open_regular;
@@ -58,16 +58,12 @@ impl Companions {
     /// # Errors
     /// [`Error::NotFound`] and [`Error::Unreadable`] for a directory that cannot be listed.
     pub fn of<'a>(source: &Path, weights: impl Iterator<Item = &'a Path>) -> Result<Self> {
-        let is_directory = source.is_dir();
-        let root = match is_directory {
-            true => source,
-            false => source.parent().unwrap_or(Path::new("")),
-        };
+        let root = directory_of(source);
         let mut companions = Self {
             root: root.to_owned(),
             ..Self::default()
         };
-        if is_directory {
+        if source.is_dir() {
             let weights: BTreeSet<&Path> = weights.collect();
             companions.add_folder(Path::new(""), &weights)?;
         } else if root.join(OWN_CONFIG).is_file() {

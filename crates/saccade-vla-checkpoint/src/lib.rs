@@ -24,7 +24,7 @@ pub mod spec;
 mod unique_map;
 mod writer;
 
-pub use adapter::{ADAPTER_CONFIG, ADAPTER_WEIGHTS};
+pub use adapter::{ADAPTER_CONFIG, ADAPTER_WEIGHTS, directory_of};
 pub use ahead::{ReadAhead, Wanted};
 pub use companions::{Companions, OWN_CONFIG};
 pub use elements::Elements;

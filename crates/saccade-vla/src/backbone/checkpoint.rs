@@ -3,11 +3,12 @@
 
 use std::path::Path;
 
-use saccade_vla_checkpoint::{Checkpoint, read_text};
+use saccade_vla_checkpoint::{Checkpoint, directory_of};
 
 use super::config::BackboneConfig;
 use super::json::GivenConfig;
 use super::recognise::Recognised;
+use crate::config::object_in_any;
 use crate::engine::Engine;
 use crate::error::{Error, Problem, Result};
 use crate::nn::source::planner::{Plan, plan};
@@ -83,15 +84,8 @@ impl BackboneCheckpoint {
 
 /// The config next to the weights; an empty one if there is none.
 fn config_of(source: &Path) -> Result<GivenConfig> {
-    let directory = match source.is_dir() {
-        true => source,
-        false => source.parent().unwrap_or(Path::new("")),
-    };
-    let path = directory.join("config.json");
-    match path.exists() {
-        true => GivenConfig::parse(&read_text("config", &path)?).map_err(|error| error.in_file(&path)),
-        false => GivenConfig::parse("{}"),
-    }
+    let path = directory_of(source).join("config.json");
+    GivenConfig::of(object_in_any("config", &path)?.unwrap_or_default())
 }
 
 /// The tensors of a published backbone, by their names without a prefix.
@@ -104,9 +98,6 @@ pub(crate) fn published_specs(
         .backbone
         .as_ref()
         .expect("a release with a backbone");
-    let found = Recognised::new(
-        rules.marks().iter().map(String::as_str),
-        &GivenConfig::parse("{}")?,
-    )?;
+    let found = Recognised::new(rules.marks().iter().map(String::as_str), &GivenConfig::default())?;
     Ok(plan(|weights| found.layers(weights))?.specs)
 }

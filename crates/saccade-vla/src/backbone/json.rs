@@ -14,6 +14,7 @@ use crate::release::{BackboneRules, TowerKind, Version};
 const BACKBONE_KEY: &str = "backbone_cfg";
 
 /// A config as it is given: of a whole checkpoint, or of a backbone alone.
+#[derive(Default)]
 pub(crate) struct GivenConfig {
     top: Object,
     /// `backbone_cfg` of a whole checkpoint; empty if there is none.
@@ -26,8 +27,13 @@ impl GivenConfig {
     /// # Errors
     /// [`Error::Json`] for text that is not JSON; [`Error::Checkpoint`] if it is no object.
     pub(crate) fn parse(text: &str) -> Result<Self> {
+        Self::of(config_object(text)?)
+    }
+
+    /// # Errors
+    /// [`Error::Checkpoint`] if a part of it is no object.
+    pub(crate) fn of(top: Object) -> Result<Self> {
         let bad = |problem: String| Err(Error::Checkpoint(Problem::new("config", problem)));
-        let top = config_object(text)?;
         let mut backbone = match top.get(BACKBONE_KEY) {
             Some(Value::Object(backbone)) => backbone.clone(),
             None | Some(Value::Null) => Map::new(),

@@ -2,7 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
-use saccade_vla_checkpoint::Checkpoint;
+use saccade_vla_checkpoint::{Checkpoint, directory_of};
 use serde_json::Value;
 
 use super::files::{add_pixel_limits, options};
@@ -36,10 +36,7 @@ impl ProcessorSource {
     /// its tensors contradict.
     pub fn open(source: &Path) -> Result<Self> {
         let checkpoint = Checkpoint::open(source)?;
-        let directory = match source.is_dir() {
-            true => source,
-            false => source.parent().unwrap_or(Path::new("")),
-        };
+        let directory = directory_of(source);
         let config = object_in_any("config", &directory.join("config.json"))?;
         let config = config.map(CheckpointConfig::of).transpose()?;
         let found = {

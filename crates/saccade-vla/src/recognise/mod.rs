@@ -13,7 +13,7 @@ pub(crate) mod sizes;
 
 use std::path::Path;
 
-use saccade_vla_checkpoint::{Checkpoint, read_text};
+use saccade_vla_checkpoint::{Checkpoint, directory_of, read_text};
 use serde_json::Value;
 
 use crate::config::{CheckpointConfig, HeadConfig};
@@ -59,10 +59,7 @@ impl HeadCheckpoint {
 
     /// The same of the open `checkpoint` at `source`.
     pub(crate) fn of(checkpoint: Checkpoint, source: &Path, config: Option<&str>) -> Result<Self> {
-        let directory = match source.is_dir() {
-            true => source,
-            false => source.parent().unwrap_or(Path::new("")),
-        };
+        let directory = directory_of(source);
         let path = directory.join("config.json");
         let given_config = match config {
             Some(text) => text.to_owned(),

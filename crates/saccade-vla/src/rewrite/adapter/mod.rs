@@ -10,7 +10,7 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use saccade_vla_checkpoint::{
-    ADAPTER_CONFIG, ADAPTER_WEIGHTS, Checkpoint, Dtype, plain_name, read_text, show_shape,
+    ADAPTER_CONFIG, ADAPTER_WEIGHTS, Checkpoint, Dtype, directory_of, plain_name, read_text, show_shape,
 };
 use serde_json::value::RawValue;
 
@@ -65,15 +65,7 @@ pub fn open_base(source: &Path, config: Option<&str>, adapter: Option<&Path>) ->
 
 /// Whether the adapter is in the directory of its base.
 pub(crate) fn is_beside(source: &Path, adapter: &Path) -> bool {
-    let folder = match source.parent() {
-        Some(parent) if !source.is_dir() => parent,
-        _ => source,
-    };
-    let folder = if folder == Path::new("") {
-        Path::new(".")
-    } else {
-        folder
-    };
+    let folder = directory_of(source);
     matches!((folder.canonicalize(), adapter.canonicalize()), (Ok(one), Ok(two)) if one == two)
 }
 
@@ -124,8 +116,13 @@ impl Adapter {
         }
         let mut changes = BTreeMap::new();
         let mut problems = Vec::new();
+        let fitting = Fitting {
+            checkpoint: &checkpoint,
+            base,
+            config: &config,
+        };
         for name in checkpoint.names() {
-            match change_of(name, &checkpoint, base, &config) {
+            match fitting.change_of(name) {
                 Ok(Some((target, _))) if changes.contains_key(&target) => {
                     problems.push(format!(
                         "{name}: another tensor of the adapter changes {target} too"
@@ -138,7 +135,7 @@ impl Adapter {
                 Err(problem) => problems.push(problem),
             }
         }
-        problems.extend(left_over(&changes, base, &config));
+        problems.extend(fitting.left_over(&changes));
         if problems.is_empty() {
             return Ok(Self { checkpoint, changes });
         }
@@ -188,174 +185,172 @@ fn weights_of(directory: &Path) -> Result<PathBuf> {
     Ok(weights)
 }
 
-/// The tensor of the base that the adapter's tensor `name` changes, and how; none for the second factor of a product.
-fn change_of(
-    name: &str,
-    checkpoint: &Checkpoint,
-    base: &Checkpoint,
-    config: &AdapterConfig,
-) -> std::result::Result<Option<(String, Change)>, String> {
-    let Some(inner) = name.strip_prefix(PREFIX) else {
-        return Err(format!("{name}: expected a name that begins with {PREFIX}"));
-    };
-    let inner = plain_name(inner);
-    for (a, b, is_embedding) in [
-        (".lora_A.weight", ".lora_B.weight", false),
-        (".lora_embedding_A", ".lora_embedding_B", true),
-    ] {
-        let (own, other) = (inner.strip_suffix(a), inner.strip_suffix(b));
-        let Some(module) = own.or(other) else { continue };
-        let (end, wanted) = if own.is_some() { (a, b) } else { (b, a) };
-        let pair = format!("{}{wanted}", &name[..name.len() - end.len()]);
-        if checkpoint.shape(&pair).is_none() {
-            return Err(format!("{name} is there without {pair}"));
-        }
-        if own.is_none() {
-            return Ok(None);
-        }
-        if !config.adapts(module) {
-            return Err(format!(
-                "{name}: {module} is not one of target_modules: PEFT would ignore it"
-            ));
-        }
-        let factors = factors(module, name, &pair, is_embedding, checkpoint, base, config)?;
-        return Ok(Some((format!("{module}.weight"), Change::Add(factors))));
-    }
-    if config.saved.iter().any(|end| saves(end, &inner)) {
-        return replacement(&inner, name, checkpoint, base);
-    }
-    Err(format!(
-        "{name}: expected a lora_A or lora_B, or a tensor of modules_to_save"
-    ))
-}
-
 /// Whether tensor `name` is in a module whose name ends so. PEFT compares letters here, not parts of the path.
 fn saves(end: &str, name: &str) -> bool {
     name.match_indices('.').any(|(dot, _)| name[..dot].ends_with(end))
 }
 
-fn replacement(
-    target: &str,
-    name: &str,
-    checkpoint: &Checkpoint,
-    base: &Checkpoint,
-) -> std::result::Result<Option<(String, Change)>, String> {
-    let shape = checkpoint.shape(name).unwrap_or_default();
-    match base.shape(target) {
-        None => Err(format!("{name}: {}", missing(target, base))),
-        Some(there) if there != shape => Err(format!(
-            "{name} has shape {}, expected {}",
-            show_shape(shape),
-            show_shape(there)
-        )),
-        Some(_) => {
-            let types = [base.dtype(target), checkpoint.dtype(name)];
-            match types.map(|dtype| dtype.ok().and_then(Float::of)) {
-                [Some(_), Some(_)] => Ok(Some((target.to_owned(), Change::Replace(name.to_owned())))),
-                _ => Err(format!(
-                    "{name}: expected F32, BF16 or F16 in the adapter and in the base"
-                )),
+/// Whether a tensor that is there holds floating-point numbers.
+fn is_float(checkpoint: &Checkpoint, name: &str) -> bool {
+    checkpoint.dtype(name).ok().and_then(Float::of).is_some()
+}
+
+/// An adapter on its way onto its base.
+struct Fitting<'a> {
+    checkpoint: &'a Checkpoint,
+    base: &'a Checkpoint,
+    config: &'a AdapterConfig,
+}
+
+impl Fitting<'_> {
+    /// The tensor of the base that the adapter's tensor `name` changes, and how; none for the second factor of a
+    /// product.
+    fn change_of(&self, name: &str) -> std::result::Result<Option<(String, Change)>, String> {
+        let Some(inner) = name.strip_prefix(PREFIX) else {
+            return Err(format!("{name}: expected a name that begins with {PREFIX}"));
+        };
+        let inner = plain_name(inner);
+        for (a, b, is_embedding) in [
+            (".lora_A.weight", ".lora_B.weight", false),
+            (".lora_embedding_A", ".lora_embedding_B", true),
+        ] {
+            let (own, other) = (inner.strip_suffix(a), inner.strip_suffix(b));
+            let Some(module) = own.or(other) else { continue };
+            let (end, wanted) = if own.is_some() { (a, b) } else { (b, a) };
+            let pair = format!("{}{wanted}", &name[..name.len() - end.len()]);
+            if self.checkpoint.shape(&pair).is_none() {
+                return Err(format!("{name} is there without {pair}"));
             }
+            if own.is_none() {
+                return Ok(None);
+            }
+            if !self.config.adapts(module) {
+                return Err(format!(
+                    "{name}: {module} is not one of target_modules: PEFT would ignore it"
+                ));
+            }
+            let factors = self.factors(module, name, &pair, is_embedding)?;
+            return Ok(Some((format!("{module}.weight"), Change::Add(factors))));
         }
+        if self.config.saved.iter().any(|end| saves(end, &inner)) {
+            self.check_replacement(&inner, name)?;
+            return Ok(Some((inner.into_owned(), Change::Replace(name.to_owned()))));
+        }
+        Err(format!(
+            "{name}: expected a lora_A or lora_B, or a tensor of modules_to_save"
+        ))
     }
-}
 
-fn factors(
-    module: &str,
-    a: &str,
-    b: &str,
-    is_embedding: bool,
-    checkpoint: &Checkpoint,
-    base: &Checkpoint,
-    config: &AdapterConfig,
-) -> std::result::Result<Factors, String> {
-    let target = format!("{module}.weight");
-    let Some(weight) = base.shape(&target) else {
-        return Err(format!("{a}: {}", missing(&target, base)));
-    };
-    let (shape_a, shape_b) = (
-        checkpoint.shape(a).unwrap_or_default(),
-        checkpoint.shape(b).unwrap_or_default(),
-    );
-    let (rank, scaling) = config.scaling(module);
-    let shown = format!(
-        "{a} {}, {b} {} and {target} {}",
-        show_shape(shape_a),
-        show_shape(shape_b),
-        show_shape(weight)
-    );
-    let fits = match (is_embedding, weight) {
-        (true, &[rows, columns]) => shape_a == [rank as usize, rows] && shape_b == [columns, rank as usize],
-        // The second layer of a convolution has a kernel of one.
-        (false, [rows, columns @ ..]) if !columns.is_empty() => {
-            shape_a.first() == Some(&(rank as usize))
-                && shape_a[1..] == *columns
-                && shape_b.get(..2) == Some(&[*rows, rank as usize])
-                && shape_b.len() == weight.len()
-                && shape_b[2..].iter().all(|&size| size == 1)
-        }
-        _ => false,
-    };
-    if !fits || weight.contains(&0) {
-        return Err(format!(
-            "{shown} do not fit each other and rank {rank} of the config"
-        ));
+    /// The shape of tensor `target` of the base, which the adapter's tensor `name` changes.
+    fn base_shape(&self, target: &str, name: &str) -> std::result::Result<&[usize], String> {
+        const LEROBOT: &str = "_groot_model.";
+        let is_lerobot = |name: &str| name.starts_with(LEROBOT);
+        self.base.shape(target).ok_or_else(|| {
+            let hint = match (is_lerobot(target), self.base.names().any(is_lerobot)) {
+                (true, false) => ": the adapter is of a checkpoint in lerobot's layout, the base is not",
+                (false, true) => ": the base is in lerobot's layout, the adapter is of another",
+                _ => "",
+            };
+            format!("{name}: the base has no {target}{hint}")
+        })
     }
-    let types = [base.dtype(&target), checkpoint.dtype(a), checkpoint.dtype(b)];
-    if types
-        .iter()
-        .any(|dtype| dtype.as_ref().ok().copied().and_then(Float::of).is_none())
-    {
-        return Err(format!("{shown}: expected F32, BF16 or F16"));
-    }
-    Ok(Factors {
-        a: a.to_owned(),
-        b: b.to_owned(),
-        is_embedding,
-        rows: weight[0],
-        columns: weight[1..].iter().product(),
-        rank: rank as usize,
-        scaling,
-    })
-}
 
-/// That the base has no tensor `target`, and whose names it may have instead.
-fn missing(target: &str, base: &Checkpoint) -> String {
-    const LEROBOT: &str = "_groot_model.";
-    let is_lerobot = base.names().any(|name| name.starts_with(LEROBOT));
-    let hint = match (target.starts_with(LEROBOT), is_lerobot) {
-        (true, false) => ": the adapter is of a checkpoint in lerobot's layout, the base is not",
-        (false, true) => ": the base is in lerobot's layout, the adapter is of another",
-        _ => "",
-    };
-    format!("the base has no {target}{hint}")
-}
-
-/// Names in the config that nothing in the adapter's file fits, and tensors of the base that the file should replace.
-fn left_over(changes: &BTreeMap<String, Change>, base: &Checkpoint, config: &AdapterConfig) -> Vec<String> {
-    let modules: Vec<&str> = changes
-        .iter()
-        .filter(|(_, change)| matches!(change, Change::Add(_)))
-        .filter_map(|(name, _)| name.strip_suffix(".weight"))
-        .collect();
-    let nothing = |what: &str| format!("target_modules: {what} fits no tensor of the adapter");
-    let mut problems = match &config.targets {
-        Names::Ends(ends) => {
-            let unused = ends
-                .iter()
-                .filter(|end| !modules.iter().any(|module| is_end(end, module)));
-            unused.map(|end| nothing(end)).collect()
+    /// That the adapter's tensor `name` can take the place of tensor `target` of the base.
+    fn check_replacement(&self, target: &str, name: &str) -> std::result::Result<(), String> {
+        let (shape, there) = (
+            self.checkpoint.shape(name).unwrap_or_default(),
+            self.base_shape(target, name)?,
+        );
+        if there != shape {
+            let (shape, there) = (show_shape(shape), show_shape(there));
+            return Err(format!("{name} has shape {shape}, expected {there}"));
         }
-        Names::Pattern(_) if modules.is_empty() => vec![nothing("its pattern")],
-        Names::Pattern(_) => Vec::new(),
-    };
-    for end in &config.saved {
-        let in_base: Vec<&str> = base.names().filter(|name| saves(end, name)).collect();
-        if in_base.is_empty() {
-            problems.push(format!("modules_to_save: {end} fits no tensor of the base"));
+        match is_float(self.base, target) && is_float(self.checkpoint, name) {
+            true => Ok(()),
+            false => Err(format!(
+                "{name}: expected F32, BF16 or F16 in the adapter and in the base"
+            )),
         }
-        let absent = in_base.into_iter().filter(|name| !changes.contains_key(*name));
-        problems.extend(absent.map(|name| format!("{name} of modules_to_save is not in the adapter")));
     }
-    problems
+
+    fn factors(
+        &self,
+        module: &str,
+        a: &str,
+        b: &str,
+        is_embedding: bool,
+    ) -> std::result::Result<Factors, String> {
+        let target = format!("{module}.weight");
+        let weight = self.base_shape(&target, a)?;
+        let [shape_a, shape_b] = [a, b].map(|name| self.checkpoint.shape(name).unwrap_or_default());
+        let (rank, scaling) = self.config.scaling(module);
+        let rank = rank as usize;
+        let shown = format!(
+            "{a} {}, {b} {} and {target} {}",
+            show_shape(shape_a),
+            show_shape(shape_b),
+            show_shape(weight)
+        );
+        let fits = match (is_embedding, weight) {
+            (true, &[rows, columns]) => shape_a == [rank, rows] && shape_b == [columns, rank],
+            // The second layer of a convolution has a kernel of one.
+            (false, [rows, columns @ ..]) if !columns.is_empty() => {
+                shape_a.first() == Some(&rank)
+                    && shape_a[1..] == *columns
+                    && shape_b.get(..2) == Some(&[*rows, rank])
+                    && shape_b.len() == weight.len()
+                    && shape_b[2..].iter().all(|&size| size == 1)
+            }
+            _ => false,
+        };
+        if !fits || weight.contains(&0) {
+            return Err(format!(
+                "{shown} do not fit each other and rank {rank} of the config"
+            ));
+        }
+        let are_floats =
+            is_float(self.base, &target) && [a, b].iter().all(|name| is_float(self.checkpoint, name));
+        if !are_floats {
+            return Err(format!("{shown}: expected F32, BF16 or F16"));
+        }
+        Ok(Factors {
+            a: a.to_owned(),
+            b: b.to_owned(),
+            is_embedding,
+            rows: weight[0],
+            columns: weight[1..].iter().product(),
+            rank,
+            scaling,
+        })
+    }
+
+    /// Names in the config that nothing in the adapter's file fits, and tensors of the base that the file should
+    /// replace.
+    fn left_over(&self, changes: &BTreeMap<String, Change>) -> Vec<String> {
+        let modules: Vec<&str> = changes
+            .iter()
+            .filter(|(_, change)| matches!(change, Change::Add(_)))
+            .filter_map(|(name, _)| name.strip_suffix(".weight"))
+            .collect();
+        let nothing = |what: &str| format!("target_modules: {what} fits no tensor of the adapter");
+        let mut problems = match &self.config.targets {
+            Names::Ends(ends) => {
+                let unused = ends
+                    .iter()
+                    .filter(|end| !modules.iter().any(|module| is_end(end, module)));
+                unused.map(|end| nothing(end)).collect()
+            }
+            Names::Pattern(_) if modules.is_empty() => vec![nothing("its pattern")],
+            Names::Pattern(_) => Vec::new(),
+        };
+        for end in &self.config.saved {
+            let in_base: Vec<&str> = self.base.names().filter(|name| saves(end, name)).collect();
+            if in_base.is_empty() {
+                problems.push(format!("modules_to_save: {end} fits no tensor of the base"));
+            }
+            let absent = in_base.into_iter().filter(|name| !changes.contains_key(*name));
+            problems.extend(absent.map(|name| format!("{name} of modules_to_save is not in the adapter")));
+        }
+        problems
+    }
 }
