@@ -1,4 +1,4 @@
-//! Reading: files that change meanwhile, slices, threads, tensors that are read ahead, names of wrapped models.
+//! Reading: files that change meanwhile, slices, threads, reading ahead, names of wrapped models.
 
 mod common;
 

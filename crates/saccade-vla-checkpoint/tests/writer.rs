@@ -91,7 +91,7 @@ fn threads_that_write_under_one_name_do_not_meet() {
         for _ in 0..8 {
             scope.spawn(|| {
                 for _ in 0..50 {
-                    // Each file is new, so that two writers in one directory, or one that removes another's, would fail.
+                    // Each file is new: two writers in one directory, or one that removes another's, would fail.
                     drop(half_written(&out, u64::MAX, false));
                 }
             });

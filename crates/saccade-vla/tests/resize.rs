@@ -31,7 +31,8 @@ impl Directory {
         Self(std::env::temp_dir().join(format!("saccade-resized-{}-{number}", std::process::id())))
     }
 
-    /// Writes the checkpoint `name` of a head of the sizes in `sizes`, with `config` beside its tensors, whose names begin with `prefix`.
+    /// Writes the checkpoint `name` of a head of the sizes in `sizes`, with `config` beside its tensors, whose
+    /// names begin with `prefix`.
     fn write(&self, name: &str, sizes: &str, config: &str, prefix: &str) {
         let shapes = tensor_shapes(&HeadConfig::from_json(sizes).unwrap()).unwrap();
         let planned: Vec<PlannedTensor> = shapes

@@ -1,4 +1,5 @@
-//! JSON objects and their values by type. What is missing or of another type is listed, and one error says all of it.
+//! JSON objects and their values by type. What is missing or of another type is listed, and one error says all
+//! of it.
 
 use std::ops::RangeInclusive;
 use std::path::Path;
@@ -72,7 +73,8 @@ impl Problems {
         self.0.push(problem);
     }
 
-    /// `config`, unless something is wrong with it: with its values, or if these are good by what `contradictions` lists.
+    /// `config`, unless something is wrong with it: with its values, or if these are good by what
+    /// `contradictions` lists.
     ///
     /// # Errors
     /// [`Error::Checkpoint`] that lists everything.

@@ -203,8 +203,8 @@ struct Fitting<'a> {
 }
 
 impl Fitting<'_> {
-    /// The tensor of the base that the adapter's tensor `name` changes, and how; none for the second factor of a
-    /// product.
+    /// The tensor of the base that the adapter's tensor `name` changes, and how; none for the second factor of
+    /// a product.
     fn change_of(&self, name: &str) -> std::result::Result<Option<(String, Change)>, String> {
         let Some(inner) = name.strip_prefix(PREFIX) else {
             return Err(format!("{name}: expected a name that begins with {PREFIX}"));
@@ -324,8 +324,8 @@ impl Fitting<'_> {
         })
     }
 
-    /// Names in the config that nothing in the adapter's file fits, and tensors of the base that the file should
-    /// replace.
+    /// Names in the config that nothing in the adapter's file fits, and tensors of the base that the file
+    /// should replace.
     fn left_over(&self, changes: &BTreeMap<String, Change>) -> Vec<String> {
         let modules: Vec<&str> = changes
             .iter()
