@@ -20,7 +20,7 @@ EXTRAS = LAB
 
 EPILOG = """\
 Tasks of the demo: reach, push, drawer-open, button-press-topdown, window-open. Harder tasks, for studies:
-two-goals, stereo-reach, two-stage, fork.
+two-goals, stereo-reach, two-stage, fork, touch-yellow, touch-blue.
 
 --out writes DIR/TASK/SEED.npz for `saccade train`, --record a data set that lerobot and
 saccade.datasets.open read. If the command is interrupted, run it again: with --out it

@@ -35,7 +35,8 @@ COLUMNS = 50  # of the contact sheet: with more seeds, only the first ones are s
 
 EPILOG = """\
 Tasks of the demo, which the bundled policy knows: reach, push, drawer-open, button-press-topdown,
-window-open. Harder tasks, for policies of your own: two-goals, stereo-reach, two-stage, fork.
+window-open. Harder tasks, for policies of your own: two-goals, stereo-reach, two-stage, fork,
+touch-yellow, touch-blue.
 
 The same seed gives the same layout, wording and noise with either engine. Seeds from 1000000 on are reserved
 for training and refused.

@@ -56,6 +56,12 @@ NUMBERS = (
         "share of frames with the instruction of an absent object, for which the policy learns to keep still",
     ),
     (
+        "--language-dropout",
+        0.0,
+        1.0,
+        "share of frames with the released default for a missing instruction, which guidance makes use of",
+    ),
+    (
         "--alignment-weight",
         0.0,
         float("inf"),

@@ -326,3 +326,62 @@ class Fork(BallScenario):
     def expert_action(self, state: Float64Array) -> Float64Array:
         """Moves straight to ``aim``, faster than in the other tasks; the gripper is not used."""
         return np.append(self.SPEED * (self.aim() - self.fingertips()), 0.0)
+
+
+class NamedBall(BallScenario):
+    """A yellow ball and a blue one, one on each side: touch the one that the instruction names.
+
+    The layout is that of :class:`Fork` without the ball in the middle. Which colour is on the left is drawn
+    for each episode from its seed alone, so the tasks of both colours have the same layouts.
+
+    Args:
+        world: Meta-World's reach environment.
+        named: The place of the named colour in ``COLOURS``.
+
+    Attributes:
+        touched: The place in ``COLOURS`` of the ball that was touched first; None before.
+    """
+
+    COLOURS = (YELLOW, BLUE)
+
+    touched: int | None = None
+
+    def __init__(self, world: Any, named: int) -> None:
+        super().__init__(world)
+        self.named = named
+
+    def place(self, rng: np.random.Generator) -> tuple[Ball, ...]:
+        """The yellow ball, the blue one."""
+        self.touched = None
+        side = int(rng.choice((-1, 1)))
+        aside, ahead, up = np.array([Fork.ASIDE, Fork.AHEAD, 0.0]) + rng.uniform(-Fork.JITTER, Fork.JITTER)
+        hand = self.fingertips()
+        middle = np.array([hand[0], hand[1] + ahead, Fork.HEIGHT + up])
+        return tuple(
+            Ball(middle + np.array([way * aside, 0.0, 0.0]), BALL_RADIUS, colour)
+            for way, colour in zip((side, -side), self.COLOURS, strict=True)
+        )
+
+    @property
+    def is_right(self) -> bool:
+        """Whether the named ball is on the right."""
+        return bool(self.placed[self.named].position[0] > self.placed[1 - self.named].position[0])
+
+    def outcome(self, reward: float, success: bool) -> StepOutcome:
+        """Touching the named ball is success if the other one was not touched before."""
+        if self.touched is None:
+            near = [place for place, ball in enumerate(self.placed) if self.distance(ball) <= TOUCH]
+            self.touched = near[0] if near else None
+        return StepOutcome(-self.distance_left(), self.touched == self.named)
+
+    def aim(self) -> Float64Array:
+        """The named ball."""
+        return self.placed[self.named].position
+
+    def distance_left(self) -> float:
+        """Distance to the named ball."""
+        return self.distance(self.placed[self.named])
+
+    def expert_action(self, state: Float64Array) -> Float64Array:
+        """Moves straight to ``aim``, as fast as the expert of :class:`Fork`; the gripper is not used."""
+        return np.append(Fork.SPEED * (self.aim() - self.fingertips()), 0.0)

@@ -6,7 +6,15 @@ from dataclasses import dataclass
 from typing import Any
 
 from saccade.errors import InputError
-from saccade_lab.sim.scenarios import Fork, MetaWorldScenario, Scenario, StereoReach, TwoGoals, TwoStage
+from saccade_lab.sim.scenarios import (
+    Fork,
+    MetaWorldScenario,
+    NamedBall,
+    Scenario,
+    StereoReach,
+    TwoGoals,
+    TwoStage,
+)
 
 # The robot is the same in every task.
 ACTION_DIM = 4  # hand velocity along x, y, z and gripper effort, each in [-1, 1]
@@ -123,7 +131,7 @@ DEMO_TASKS = (
     ),
 )
 # Harder tasks for studies: two equally good answers, a position that one image does not determine, two steps
-# in order, and two paths around an obstacle.
+# in order, two paths around an obstacle, and two balls of which the instruction names one.
 STUDY_TASKS = (
     Task(
         name="two-goals",
@@ -180,6 +188,34 @@ STUDY_TASKS = (
             "pass the blue ball and touch a yellow ball",
         ),
         max_steps=28,  # 5 more than the expert needs: no time to drift off the middle line gradually
+    ),
+    Task(
+        name="touch-yellow",
+        scene="reach-v3",
+        scenario=functools.partial(NamedBall, named=0),
+        objects="yellow ball and blue ball",
+        instructions=(
+            "touch the yellow ball",
+            "tap the yellow ball",
+            "move to the yellow ball",
+            "bring the hand to the yellow ball",
+            "reach over to the yellow ball",
+        ),
+        max_steps=40,
+    ),
+    Task(
+        name="touch-blue",
+        scene="reach-v3",
+        scenario=functools.partial(NamedBall, named=1),
+        objects="yellow ball and blue ball",
+        instructions=(
+            "touch the blue ball",
+            "tap the blue ball",
+            "move to the blue ball",
+            "bring the hand to the blue ball",
+            "reach over to the blue ball",
+        ),
+        max_steps=40,
     ),
 )
 # The index of a task in this order seeds its noise: append new tasks at the end.

@@ -26,7 +26,7 @@ def features_name(start_sha256: str, recording_sha256: str, samples: str) -> str
 CATEGORY_STD = 0.02  # of the released code: `saccade_lab.reference.layers.TABLE_STD`, which needs torch
 RELEASED_WIDTH = 1536  # of GR00T N1.5
 #: Settings that were added after the first runs; see ``TrainingSettings.to_dict``.
-ADDED = ("category_std",)
+ADDED = ("category_std", "language_dropout")
 
 
 def released_std(width: int) -> float:
@@ -64,6 +64,9 @@ class TrainingSettings:
         absent_share: Share of frames that get the instruction of a task whose object is absent, with standing
             still as the action. Without them the images alone distinguish most tasks, and the policy ignores
             the words.
+        language_dropout: Share of the other frames that get the released default for a missing instruction,
+            as ``language_dropout_prob`` of Isaac-GR00T N1.5's training. Guidance needs a policy that knows
+            it.
         start_sha256: Hash of the tensors that the run starts from; empty for random ones. ``train`` sets it.
         seed: Seed of initial weights, order and noise.
         category_std: Standard deviation of the initial category-specific weights, those of the state encoder
@@ -92,6 +95,7 @@ class TrainingSettings:
     alignment_weight: float = 0.0
     alignment_block: int | None = None
     absent_share: float = 0.1
+    language_dropout: float = 0.0
     start_sha256: str = ""
     seed: int = 0
     category_std: float = CATEGORY_STD
@@ -114,11 +118,15 @@ class TrainingSettings:
     def __post_init__(self) -> None:
         if self.only not in ("", "backbone", "head"):
             raise InputError(f"only: given {self.only!r}, expected '', 'backbone' or 'head'")
-        if self.only == "head" and self.absent_share:
-            raise InputError(
-                f"absent_share: given {self.absent_share}, expected 0 where only the head is trained: the "
-                "features of a frame are computed once, with an instruction of its own task"
-            )
+        for name, share in (
+            ("absent_share", self.absent_share),
+            ("language_dropout", self.language_dropout),
+        ):
+            if self.only == "head" and share:
+                raise InputError(
+                    f"{name}: given {share}, expected 0 where only the head is trained: the features of a "
+                    "frame are computed once, with an instruction of its own task"
+                )
         for name, width in (("width", self.width), ("language_width", self.language_width)):
             if width % (2 * self.num_heads):
                 raise InputError(

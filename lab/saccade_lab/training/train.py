@@ -166,7 +166,7 @@ class Batches:
         prompts: What ``prompts_of`` returns.
         targets: Mean and standard deviation of the positions, ``(6,)`` each.
         batch_size: Frames per batch.
-        absent_share: See ``TrainingSettings``.
+        absent_share, language_dropout: See ``TrainingSettings``.
         frozen: The features of the samples' frames, if the backbone is not trained.
         with_later: Whether batches contain the observations after the chunk was executed.
     """
@@ -180,6 +180,7 @@ class Batches:
         batch_size: int,
         *,
         absent_share: float = 0.0,
+        language_dropout: float = 0.0,
         frozen: FrozenFeatures | None = None,
         with_later: bool = False,
     ) -> None:
@@ -187,7 +188,7 @@ class Batches:
         self._frozen = frozen
         self._with_later = with_later
         self._batch_size = batch_size
-        self._absent_share = absent_share
+        self._absent_share, self._language_dropout = absent_share, language_dropout
         normalizer = config.normalizer
         self._state = np.asarray(normalizer.state(samples.state))
         self._actions = normalized_actions(normalizer, samples.actions) * samples.mask
@@ -206,13 +207,18 @@ class Batches:
         rows = rng.integers(len(self._samples), size=self._batch_size)
         tasks, later = self._samples.tasks[rows], self._samples.later[rows]
         actions, mask = self._actions[rows], self._samples.mask[rows]
+        is_absent = np.zeros(len(rows), dtype=bool)
         for row in np.flatnonzero(rng.random(len(rows)) < self._absent_share):
             if self._impossible[tasks[row]]:
+                is_absent[row] = True
                 tasks[row] = rng.choice(self._impossible[tasks[row]])
                 actions[row], mask[row] = self._still, 1.0
                 later[row] = self._samples.now[rows[row]]
         said = [self._prompts[task] for task in tasks]
         prompts = [prompts[rng.integers(len(prompts))] for prompts in said]
+        if self._language_dropout:
+            for row in np.flatnonzero((rng.random(len(rows)) < self._language_dropout) & ~is_absent):
+                prompts[row] = self._prompts[-1][0]
         return Batch(
             inputs=self._inputs(self._samples.now[rows], prompts),
             state=torch.from_numpy(self._state[rows]),
@@ -231,10 +237,11 @@ class Batches:
 
 
 def prompts_of(config: PolicyConfig, processor: Processor) -> list[list[npt.NDArray[np.int64]]]:
-    """The token ids ``(T,)`` of every wording of every task in ``TASKS``."""
+    """The token ids ``(T,)`` of every wording of every task in ``TASKS``; last, of the released default."""
     shown = np.zeros((config.simulation.image_size, config.simulation.image_size, 3), np.uint8)
     frames = [shown] * len(config.simulation.cameras)
-    return [[processor(frames, text).input_ids[0] for text in task.instructions] for task in TASKS.values()]
+    said: list[tuple[str | None, ...]] = [*(task.instructions for task in TASKS.values()), (None,)]
+    return [[processor(frames, text).input_ids[0] for text in texts] for texts in said]
 
 
 def train_step(run: Run, batches: Batches) -> dict[str, float]:
@@ -424,7 +431,7 @@ def train(
 
     prompts = prompts_of(config, processor)
 
-    def batches_of(samples: Samples, name: str, size: int, absent_share: float) -> Batches:
+    def batches_of(samples: Samples, name: str, size: int, **shares: float) -> Batches:
         frozen = None
         if settings.only == "head":
             frozen = FrozenFeatures(samples, prompts, run.learner.backbone, features[name])
@@ -434,13 +441,14 @@ def train(
             prompts,
             targets,
             size,
-            absent_share=absent_share,
+            **shares,
             frozen=frozen,
             with_later=settings.aligned_block is not None,
         )
 
-    batches = batches_of(training, TRAINING, settings.batch_size, settings.absent_share)
-    held_out = batches_of(validation, VALIDATION, VALIDATION_FRAMES, 0.0)
+    shares = {"absent_share": settings.absent_share, "language_dropout": settings.language_dropout}
+    batches = batches_of(training, TRAINING, settings.batch_size, **shares)
+    held_out = batches_of(validation, VALIDATION, VALIDATION_FRAMES)
     try:
         loop(run, batches, held_out, out, on_step)
     finally:

@@ -188,6 +188,7 @@ CASES: list[tuple[Sequence[str], str]] = [
     (["train", "--demos", "nowhere", "--num-future-tokens", "-1"], "--num-future-tokens: given -1"),
     (["train", "--demos", "nowhere", "--learning-rate", "nan"], "--learning-rate: given nan"),
     (["train", "--demos", "nowhere", "--absent-share", "1"], "--absent-share: given 1.0"),
+    (["train", "--demos", "nowhere", "--language-dropout", "-1"], "--language-dropout: given -1"),
     (["train", "--demos", "nowhere", "--start-from", "missing"], "missing: no policy there"),
     (["train", "--demos", "nowhere", "--num-threads", "0"], "--num-threads: given 0"),
 ]

@@ -1,4 +1,4 @@
-"""The tasks made for studies: two goals, a place that takes two cameras, two stages, a fork."""
+"""The tasks made for studies: two goals, a place that takes two cameras, two stages, a fork, named balls."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ from saccade_lab.sim import demos, graphics
 from saccade_lab.sim.cameras import DEFAULT_CAMERAS, DEFAULT_IMAGE_SIZE, CameraPose
 from saccade_lab.sim.environment import TaskEnvironment
 from saccade_lab.sim.experts import Expert
-from saccade_lab.sim.scenarios import TOUCH, Ball, BallScenario, Fork, StereoReach, TwoGoals
+from saccade_lab.sim.scenarios import TOUCH, Ball, BallScenario, Fork, NamedBall, StereoReach, TwoGoals
 from saccade_lab.sim.tasks import DEMO_TASKS, DEMONSTRATION_SEEDS, STUDY_TASKS, TASKS, check_evaluation_seeds
 
 Float64Array = npt.NDArray[np.float64]
 
-NAMES = ("two-goals", "stereo-reach", "two-stage", "fork")
+NAMES = ("two-goals", "stereo-reach", "two-stage", "fork", "touch-yellow", "touch-blue")
 SHIPPED = ("reach", "push", "drawer-open", "button-press-topdown", "window-open")
 FIELD_OF_VIEW = 45.0  # degrees, MuJoCo's default for a free camera
 
@@ -288,6 +288,39 @@ def test_the_mean_of_both_ways_touches_the_blue_ball_and_then_nothing_counts() -
             assert not go_to(environment, scenario.placed[0].position)
             environment.restart(seed)
             assert go_to(environment, scenario.placed[0].position)
+
+
+def test_the_words_alone_tell_which_ball_is_meant() -> None:
+    rights = []
+    with make("touch-yellow") as yellow, make("touch-blue") as blue:
+        for seed in range(60):
+            seen = [environment.reset(seed=seed)[0] for environment in (yellow, blue)]
+            if seed < 3:
+                for camera in DEFAULT_CAMERAS:
+                    np.testing.assert_array_equal(*(one["images"][camera.name] for one in seen))
+            words = [set(one["instruction"].split()) for one in seen]
+            assert (words[0] - words[1], words[1] - words[0]) == ({"yellow"}, {"blue"})
+            scenarios = [environment.scenario for environment in (yellow, blue)]
+            assert all(isinstance(scenario, NamedBall) for scenario in scenarios)
+            assert [ball.rgba for ball in balls_of(yellow)] == [ball.rgba for ball in balls_of(blue)]
+            rights.append(scenarios[0].is_right)  # type: ignore[attr-defined]
+            assert scenarios[1].is_right != rights[-1]  # type: ignore[attr-defined]
+            actions = [Expert(environment).action() for environment in (yellow, blue)]
+            assert (actions[0][0] > 0) == rights[-1] != (actions[1][0] > 0)
+    assert 17 <= sum(rights) <= 43
+
+
+def test_the_first_touch_decides_between_named_balls() -> None:
+    with make("touch-blue") as environment:
+        scenario = environment.scenario
+        assert isinstance(scenario, NamedBall)
+        for first, last in ((0, 1), (1, 0)):
+            environment.restart(7)
+            assert not environment.advance(np.zeros(4)).success
+            assert go_to(environment, scenario.placed[first].position) == (first == 1)
+            assert scenario.touched == first
+            assert go_to(environment, scenario.placed[last].position) == (first == 1)
+            assert scenario.touched == first
 
 
 def test_success_is_a_touch_of_five_centimetres() -> None:

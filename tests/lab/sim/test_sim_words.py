@@ -20,9 +20,12 @@ from saccade_lab.training.dataset import Samples
 from saccade_lab.training.settings import TrainingSettings
 
 FRAMES, HORIZON = 40, 4
+DEFAULT = "Perform the default behavior."  # Isaac-GR00T N1.5, where there is no instruction
 
 
-def make_batches(tasks: list[str], absent_share: float) -> tuple[train.Batches, Processor]:
+def make_batches(
+    tasks: list[str], absent_share: float, language_dropout: float = 0.0
+) -> tuple[train.Batches, Processor]:
     """Batches of random samples of the tasks, and what prepares their words."""
     rng = np.random.default_rng(0)
     numbers = [list(TASKS).index(task) for task in tasks]
@@ -42,7 +45,16 @@ def make_batches(tasks: list[str], absent_share: float) -> tuple[train.Batches, 
     processor = config.processor()
     targets = np.zeros(6, np.float32), np.ones(6, np.float32)
     prompts = train.prompts_of(config, processor)
-    return train.Batches(samples, config, prompts, targets, 64, absent_share=absent_share), processor
+    batches = train.Batches(
+        samples,
+        config,
+        prompts,
+        targets,
+        64,
+        absent_share=absent_share,
+        language_dropout=language_dropout,
+    )
+    return batches, processor
 
 
 def tasks_told(inputs: BackboneInputs | BackboneFeatures, processor: Processor) -> list[str]:
@@ -53,7 +65,7 @@ def tasks_told(inputs: BackboneInputs | BackboneFeatures, processor: Processor) 
         tuple(processor(frames, text).input_ids[0]): name
         for name, task in TASKS.items()
         for text in task.instructions
-    }
+    } | {tuple(processor(frames, DEFAULT).input_ids[0]): DEFAULT}
     prompts = zip(inputs.input_ids, inputs.attention_mask, strict=True)
     return [wordings[tuple(prompt[mask])] for prompt, mask in prompts]
 
@@ -76,6 +88,23 @@ def test_tasks_of_one_scene_are_never_told_as_absent(tasks: list[str]) -> None:
     batches, _ = make_batches(tasks, absent_share=1.0)
     plain, _ = make_batches(tasks, absent_share=0.0)
     np.testing.assert_array_equal(batches.draw(1).actions, plain.draw(1).actions)
+
+
+def test_dropped_words_are_the_released_default_and_nothing_else_changes() -> None:
+    plain, processor = make_batches(["reach", "push"], absent_share=0.0)
+    dropped, _ = make_batches(["reach", "push"], absent_share=0.0, language_dropout=0.5)
+    before, after = plain.draw(2), dropped.draw(2)
+    told = tasks_told(after.inputs, processor)
+    assert 16 <= told.count(DEFAULT) <= 48  # of 64: less than one in ten thousand such batches is outside
+    for one, other in zip(told, tasks_told(before.inputs, processor), strict=True):
+        assert one in (DEFAULT, other)
+    for name in ("state", "actions", "mask", "targets"):
+        np.testing.assert_array_equal(getattr(after, name), getattr(before, name))
+
+
+def test_an_absent_task_is_always_told() -> None:
+    batches, processor = make_batches(list(TASKS), absent_share=1.0, language_dropout=0.9)
+    assert DEFAULT not in tasks_told(batches.draw(3).inputs, processor)
 
 
 def test_drawing_does_not_change_the_samples() -> None:

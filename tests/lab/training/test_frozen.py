@@ -134,6 +134,8 @@ def test_what_cannot_be_is_refused(recording: Path, pretrained: Path, tmp_path: 
         dataclasses.replace(HEAD, only="vision")  # type: ignore[arg-type]
     with pytest.raises(InputError, match=r"absent_share: given 0\.1, expected 0"):
         dataclasses.replace(HEAD, absent_share=0.1)
+    with pytest.raises(InputError, match=r"language_dropout: given 0\.2, expected 0"):
+        dataclasses.replace(HEAD, language_dropout=0.2)
     with pytest.raises(InputError, match="start: given none"):
         train.train(recording, tmp_path / "out", HEAD, ignore)
     deeper = dataclasses.replace(HEAD, vision_layers=2)

@@ -1,0 +1,280 @@
+"""Does guidance make a policy listen? Demonstrations, policies, closed loop and tables of the study.
+
+    python studies/guidance/guidance.py demos --out OUT --jobs -1    record, and choose the demonstrations
+    python studies/guidance/guidance.py train --out OUT              train the policies, one after the other
+    python studies/guidance/guidance.py judge --out OUT --jobs -1    run the episodes of all arms
+    python studies/guidance/guidance.py report --out OUT             print the tables of README.md
+
+Every part resumes where it stopped. README.md in this folder has the plan.
+"""
+
+from __future__ import annotations
+
+import argparse
+import functools
+import shutil
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from saccade._internal.arrays import Float32Array
+from saccade.errors import InputError
+from saccade_lab.parallel.arguments import add_arguments as add_worker_arguments
+from saccade_lab.parallel.arguments import workers_of
+from saccade_lab.sim import demos
+from saccade_lab.sim.environment_cache import cached_environment
+from saccade_lab.sim.policy import Chunk, Interventions, Policy
+from saccade_lab.sim.rollout import environment_for, run_episode
+from saccade_lab.sim.scenarios import NamedBall
+from saccade_lab.sim.settings import GROUPS
+from saccade_lab.study.cell import Cell, Rows
+from saccade_lab.study.run import run_cells
+from saccade_lab.study.section import points, rate
+from saccade_lab.study.statistics import holm, paired_difference, verdict, wilson
+from saccade_lab.study.table import read_table, table_path
+from saccade_lab.training.settings import TrainingSettings
+
+TASKS = ("touch-yellow", "touch-blue")
+RECORDED, CHOSEN = 400, 200  # demonstrations of each task
+#: By recording, how many of a task's chosen demonstrations have the named ball on the right.
+ON_THE_RIGHT = {"confounded": 180, "balanced": 100}
+
+SMALL = TrainingSettings(
+    steps=3200, width=64, learning_rate=2e-3, ema_decay=0.995, num_future_tokens=8, absent_share=0.0
+)
+EPISODES = 300  # of each task; the named ball is on the right in one of the two tasks of a seed
+BLOCK = 10  # seeds of a cell
+WEIGHTS = (0.0, 1.5, 2.0, 3.0, 5.0)
+PRIMARY = 2.0  # the weight of the tests
+WITHOUT = ("default", "empty")
+
+COLUMNS = (
+    "scenes",
+    "without",
+    "w",
+    "success, %",
+    "wrong ball, %",
+    "follows, %",
+    "minus w = 1",
+    "verdict",
+)
+
+
+@dataclass(frozen=True)
+class Trained:
+    """A policy of the plan: its recording, the share of dropped instructions, and the training seed."""
+
+    recording: str
+    language_dropout: float
+    seed: int
+
+    @property
+    def name(self) -> str:
+        """Its name, and that of its folder."""
+        return f"{self.recording}-dropout-{round(100 * self.language_dropout)}-seed-{self.seed}"
+
+
+POLICIES = (
+    Trained("confounded", 0.0, 0),
+    Trained("confounded", 0.1, 0),
+    Trained("balanced", 0.0, 0),
+    *(Trained("confounded", share, seed) for seed in (1, 2) for share in (0.0, 0.1)),
+)
+TESTED = tuple(one.name for one in POLICIES if (one.recording, one.seed) == ("confounded", 0))
+#: Weight and ``without`` of every arm, the unchanged policy first.
+ARMS: tuple[tuple[float, str | None], ...] = (
+    (1.0, None),
+    *((weight, without) for without in WITHOUT for weight in WEIGHTS),
+)
+
+
+def record(out: Path, args: argparse.Namespace) -> None:
+    """Records demonstrations, and chooses those of each recording."""
+    everything = out / "demos" / "all"
+    counts = dict.fromkeys(TASKS, RECORDED)
+    demos.record_tasks(counts, everything, demos.RecordingSettings(), lambda task: None, workers_of(args))
+    for recording, count in ON_THE_RIGHT.items():
+        for task in TASKS:
+            chosen = out / "demos" / recording / task
+            chosen.mkdir(parents=True, exist_ok=True)
+            for path in (*choose(everything, task, count), everything / task / "recording.json"):
+                shutil.copyfile(path, chosen / path.name)
+
+
+def choose(recorded: Path, task: str, on_the_right: int) -> list[Path]:
+    """``CHOSEN`` demonstrations of a task, so many of them with the named ball on the right.
+
+    Raises:
+        InputError: Too few were recorded.
+    """
+    missing = {True: on_the_right, False: CHOSEN - on_the_right}
+    found = []
+    for seed, demonstration in demos.episodes(recorded, task, images=False):
+        yellow, blue = demonstration.targets[0, 0], demonstration.targets[0, 3]
+        is_right = bool(yellow > blue) == (task == "touch-yellow")
+        if missing[is_right]:
+            missing[is_right] -= 1
+            found.append(recorded / task / f"{seed}.npz")
+    if any(missing.values()):
+        raise InputError(f"{recorded / task}: expected {on_the_right} on the right, {missing} are missing")
+    return found
+
+
+def train_all(out: Path, names: Sequence[str]) -> None:
+    """Trains the policies of these names, or all, in the order of the plan."""
+    import torch
+
+    from saccade_lab.training.train import train
+
+    torch.set_num_threads(1)
+    for policy in POLICIES:
+        if names and policy.name not in names:
+            continue
+        settings = TrainingSettings(
+            **{**vars(SMALL), "seed": policy.seed, "language_dropout": policy.language_dropout}
+        )
+        start = time.monotonic()
+        train(out / "demos" / policy.recording, out / policy.name, settings, lambda progress: None)
+        print(f"{policy.name}: {time.monotonic() - start:.0f} s", flush=True)
+
+
+class Guided(Policy):
+    """A policy under one arm."""
+
+    def __init__(self, policy: Policy, weight: float, without: str | None) -> None:
+        super().__init__(policy.whole, policy.config, policy.checkpoint, policy.engine)
+        self.guidance = {} if without is None else {"guidance": weight, "without": without}
+
+    def act(
+        self, seen: Mapping[str, Any], *, noise: Float32Array, intervention: Interventions = None
+    ) -> Chunk:
+        """See ``Policy``. The whole time is that of the sampling."""
+        start = time.perf_counter()
+        answer = self.whole.act(
+            self.observation(seen), noise=noise, intervention=intervention, **self.guidance
+        )
+        spent = {"backbone": 0.0, "encode": 0.0, "sample": 1e3 * (time.perf_counter() - start)}
+        return Chunk(np.clip(np.concatenate([answer[name][0] for name in GROUPS], axis=-1), -1.0, 1.0), spent)
+
+
+@functools.lru_cache(maxsize=1)
+def policy_in(folder: Path) -> Policy:
+    """A trained policy. The last one is kept."""
+    return Policy.from_pretrained(folder, num_threads=1)
+
+
+@dataclass(frozen=True)
+class Judge:
+    """Runs the episodes of a cell: a policy, a task and a block of seeds, under every arm."""
+
+    out: Path
+
+    def __call__(self, cell: Cell) -> Rows:
+        """A row for each seed and arm."""
+        name, task, first = cell.key
+        policy = policy_in(self.out / str(name))
+        environment = cached_environment((str(name), str(task)), lambda: environment_for(policy, str(task)))
+        scenario = environment.scenario
+        assert isinstance(scenario, NamedBall)
+        rows = []
+        for seed in range(int(first), int(first) + BLOCK):
+            for weight, without in ARMS:
+                episode = run_episode(environment, Guided(policy, weight, without), seed)
+                rows.append(
+                    {
+                        "policy": name,
+                        "task": task,
+                        "seed": seed,
+                        "weight": weight,
+                        "without": without or "",
+                        "agrees": scenario.is_right,
+                        "success": episode.success,
+                        "wrong": scenario.touched == 1 - scenario.named,
+                        "steps": episode.steps,
+                    }
+                )
+        return rows
+
+
+def judge(out: Path, args: argparse.Namespace) -> None:
+    """Runs every episode that has not been run."""
+    trained = [policy for policy in POLICIES if (out / policy.name / "config.json").is_file()]
+    hashes = {one.name: policy_in(out / one.name).checkpoint_sha256() for one in trained}
+    cells = [
+        Cell((one.name, task, first), {"sha256": hashes[one.name]})
+        for one in trained
+        for first in range(0, EPISODES, BLOCK)
+        for task in TASKS
+    ]
+    run_cells("guidance", cells, Judge(out.absolute()), out, settings={}, workers=workers_of(args))
+
+
+def rows_of(table: pd.DataFrame, policy: str, agrees: bool) -> Iterator[tuple[Any, Any, pd.DataFrame]]:
+    """The episodes of every arm, in the order of their seeds."""
+    part = table[(table["policy"] == policy) & (table["agrees"] == agrees)]
+    for weight, without in ARMS:
+        arm = part[(part["weight"] == weight) & (part["without"].fillna("") == (without or ""))]
+        yield weight, without, arm.sort_values(["seed", "task"])
+
+
+def report(out: Path) -> None:
+    """Prints a table for each policy, and the tests."""
+    table = read_table(table_path(out, "guidance"))
+    tests: list[tuple[str, float]] = []
+    for policy in table["policy"].unique():
+        print(f"\n{policy}\n\n| {' | '.join(COLUMNS)} |\n|{'---|' * len(COLUMNS)}")
+        for agrees in (False, True):
+            arms = list(rows_of(table, policy, agrees))
+            plain = arms[0][2]
+            for weight, without, arm in arms:
+                wins, wrong = arm["success"].astype(bool), arm["wrong"].astype(bool)
+                touched = int(wins.sum() + wrong.sum())
+                pair = paired_difference(wins.tolist(), plain["success"].astype(bool).tolist())
+                cells = [
+                    "as demonstrated" if agrees else "the other way",
+                    without or "",
+                    f"{weight:g}",
+                    rate(wilson(int(wins.sum()), len(arm))),
+                    rate(wilson(int(wrong.sum()), len(arm))),
+                    rate(wilson(int(wins.sum()), touched)),
+                    "" if without is None else points(pair.difference),
+                    "" if without is None else verdict(pair.difference),
+                ]
+                print(f"| {' | '.join(cells)} |")
+                if (
+                    not agrees
+                    and weight == PRIMARY
+                    and policy.startswith("confounded")
+                    and "seed-0" in policy
+                ):
+                    tests.append((f"{policy}, without {without}", pair.p_value))
+    corrected = holm([p for _, p in tests])
+    for (name, p), after in zip(tests, corrected, strict=True):
+        print(f"\n{name}, w = {PRIMARY:g} against 1, the other way: p {p:.2g}, after Holm {after:.2g}")
+
+
+def main() -> None:
+    """Runs one part."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("part", choices=("demos", "train", "judge", "report"))
+    parser.add_argument("--out", type=Path, default=Path("out/guidance"))
+    parser.add_argument("--policies", nargs="*", default=[], help="train only these")
+    add_worker_arguments(parser, "episodes")
+    args = parser.parse_args()
+    if args.part == "demos":
+        record(args.out, args)
+    elif args.part == "train":
+        train_all(args.out, args.policies)
+    elif args.part == "judge":
+        judge(args.out, args)
+    else:
+        report(args.out)
+
+
+if __name__ == "__main__":
+    main()
