@@ -12,7 +12,7 @@ import jinja2
 from saccade import Policy
 from saccade._internal.files import write_atomically
 from saccade.diagnosis import Diagnosis, Verdict
-from saccade.diagnosis.changes import camera_of
+from saccade.diagnosis.changes import camera_of, replacement
 from saccade.evaluation import Evaluation, Recordings
 from saccade.evaluation.recordings import observation_at
 from saccade_lab.extras import LAB
@@ -83,6 +83,7 @@ def diagnosis_page(
             "advice": _advice(name, verdict),
             "most": _most(verdict),
             "frames": _frames(name, verdict, policy, data, report),
+            "texts": _texts(name, verdict, policy, data, report),
         }
         for name, verdict in report.inputs.items()
     ]
@@ -113,6 +114,17 @@ def _most(verdict: Verdict) -> tuple[str, int, int]:
     largest = max(verdict.changes, key=lambda name: verdict.changes[name].share.value)
     name = main[0] if main else largest
     return name, *verdict.changes[name].largest
+
+
+def _texts(
+    name: str, verdict: Verdict, policy: Policy, data: Recordings, report: Diagnosis
+) -> tuple[str, str | None] | None:
+    """The instruction at which it matters most, and what replaced it."""
+    if name != "instruction":
+        return None
+    _, episode, step = _most(verdict)
+    (text,) = observation_at(policy, data, episode, step).instructions
+    return None if text is None else (text, replacement(text, report.plan.instructions))
 
 
 def _frames(

@@ -10,7 +10,7 @@ from saccade._internal.arrays import integer
 from saccade.diagnosis.effects import measure_episode
 from saccade.diagnosis.plan import default_episodes, planned
 from saccade.diagnosis.report import Diagnosis, summarised
-from saccade.evaluation.recordings import Recordings, chosen_episodes
+from saccade.evaluation.recordings import Recordings, chosen_episodes, fitted
 
 if TYPE_CHECKING:
     from saccade.policy.policy import Policy
@@ -45,6 +45,7 @@ def diagnose(
         >>> def listens(policy: saccade.Policy, data: "saccade.datasets.Dataset") -> bool:
         ...     return saccade.diagnose(policy, data).inputs["instruction"].name == "used"
     """
+    data = fitted(policy, data)
     chosen = chosen_episodes(
         data, default_episodes(len(data)) if episodes is None and len(data) else episodes
     )

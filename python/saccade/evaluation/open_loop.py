@@ -10,7 +10,7 @@ from saccade._internal.arrays import integer
 from saccade.errors import InputError
 from saccade.evaluation.layout import Layout
 from saccade.evaluation.prediction import horizon_of, predict_episode
-from saccade.evaluation.recordings import Recordings, chosen_episodes
+from saccade.evaluation.recordings import Recordings, chosen_episodes, fitted
 from saccade.evaluation.report import Evaluation, summarised
 
 if TYPE_CHECKING:
@@ -51,6 +51,7 @@ def evaluate(
         >>> def error_of(policy: saccade.Policy, data: "saccade.datasets.Dataset") -> float:
         ...     return saccade.evaluate(policy, data, stride=8).mse
     """
+    data = fitted(policy, data)
     chosen = chosen_episodes(data, episodes)
     step = checked_stride(policy, stride)
     seed = integer("seed", seed, least=0)

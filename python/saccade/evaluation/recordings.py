@@ -41,6 +41,19 @@ class Recordings(Protocol):
         """The recorded actions from a step on, ``(horizon, width)`` by key, in the robot's units."""
 
 
+def fitted(policy: Policy, data: Recordings) -> Recordings:
+    """The recordings with the keys and the history of a policy, if they can be had by ``for_policy``.
+
+    Raises:
+        InputError: As :meth:`saccade.datasets.Dataset.for_policy`.
+    """
+    convert = getattr(data, "for_policy", None)
+    if convert is None:
+        return data
+    found: Recordings = convert(policy)
+    return found
+
+
 def chosen_episodes(data: Recordings, episodes: Sequence[int] | None) -> tuple[int, ...]:
     """Distinct places of episodes, in increasing order; None gives all.
 

@@ -13,11 +13,9 @@ from typing import Any
 from saccade._internal.environment import show_config
 from saccade._internal.files import sha256_of
 from saccade._internal.hub import locate
-from saccade._internal.small_files import read_json
 from saccade.datasets import Dataset
 from saccade.datasets import open as open_recordings
 from saccade.policy.policy import Policy
-from saccade.robots.reading import processor_folder
 
 #: Files of a checkpoint that decide what it computes.
 WEIGHTS, COMPANIONS = ("*.safetensors",), ("*.json", "*.txt", "*/*.json", "*/*.safetensors")
@@ -50,8 +48,13 @@ class Source:
 
     @property
     def data(self) -> Dataset:
-        """The recordings, with the keys and steps of the policy; raises as :func:`saccade.datasets.open`."""
-        return _data(self.recordings, self.checkpoint, json.dumps(self.options, sort_keys=True))
+        """The recordings, with the keys and steps of the policy.
+
+        Raises:
+            FileNotFoundError, DatasetError, InputError, MissingExtraError: As :func:`saccade.datasets.open`
+                and :meth:`saccade.datasets.Dataset.for_policy`.
+        """
+        return _data(self.recordings).for_policy(self.policy)
 
     def identity(self) -> dict[str, Any]:
         """What decides the actions: hashes, options, and what computes."""
@@ -61,7 +64,10 @@ class Source:
                 "name": Path(self.checkpoint).resolve().name,
                 "sha256": weights_hash(self.checkpoint),
             },
-            "recordings": {"name": Path(self.recordings).name, "sha256": self.data.fingerprint()},
+            "recordings": {
+                "name": Path(self.recordings).name,
+                "sha256": _data(self.recordings).fingerprint(),
+            },
             "options": {name: value for name, value in self.options.items() if name != "num_threads"},
             "saccade": config["saccade"],
             "instruction_set": config["isa"],
@@ -74,19 +80,8 @@ def _policy(checkpoint: str, options: str) -> Policy:
 
 
 @functools.lru_cache(maxsize=1)
-def _data(recordings: str, checkpoint: str, options: str) -> Dataset:
-    return open_recordings(recordings, data_config=_selection(_policy(checkpoint, options), Path(checkpoint)))
-
-
-def _selection(policy: Policy, checkpoint: Path) -> Any:
-    """What the policy takes of a data set: its data config, or its robot's modality configs; else None."""
-    if policy.normalizer.data_config is not None:
-        return policy.normalizer.data_config
-    file = processor_folder(checkpoint) / "processor_config.json"
-    if policy.normalizer.pipeline is not None or not file.is_file():
-        return None
-    robots = (read_json(file).get("processor_kwargs") or {}).get("modality_configs") or {}
-    return robots.get(str(policy.normalizer.embodiment))
+def _data(recordings: str) -> Dataset:
+    return open_recordings(recordings)
 
 
 def weights_hash(checkpoint: str | Path) -> str:

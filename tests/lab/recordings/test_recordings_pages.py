@@ -81,6 +81,7 @@ def test_the_diagnosis_page_has_every_input_with_its_frames(written: dict[str, P
     text = (written["diagnosis"] / "index.html").read_text(encoding="utf-8")
     for name in ("instruction", "camera.left", "camera.right", "camera.top", "state"):
         assert f"<h2>{name}: " in text
+    assert re.search(r'replaced matters most in episode \d at step \d: "[^"]+" by "', text)
     assert text.count("<figcaption>left, swapped</figcaption>") == 1
     assert text.count("<figcaption>left</figcaption>") == 3  # its own, the instruction's and the state's
 
