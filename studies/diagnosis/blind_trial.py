@@ -1,7 +1,7 @@
 """A blind trial of `saccade diagnose`: checkpoints operated on, judged without knowing which, then opened.
 
     python studies/diagnosis/blind_trial.py make WORK [--checkpoints 12]
-    python studies/diagnosis/blind_trial.py judge WORK RECORDINGS
+    python studies/diagnosis/blind_trial.py judge WORK RECORDINGS [--jobs 4]
     python studies/diagnosis/blind_trial.py open WORK SEAL studies/diagnosis/blind-trial.json
 
 `make` copies the bundled policy and operates on each copy in a way that it draws: nothing, all text
@@ -19,6 +19,7 @@ import json
 import secrets
 import shutil
 import time
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +28,7 @@ from safetensors.torch import load_file, save_file
 
 import saccade
 from saccade._internal.files import write_json
+from saccade_lab.parallel import Workers, each
 from saccade_lab.study.code_version import code_version
 
 EMBEDDINGS = "backbone.eagle_model.language_model.model.embed_tokens.weight"
@@ -65,14 +67,18 @@ def make(work: Path, checkpoints: int) -> None:
     print("seal", hashlib.sha256(sealed).hexdigest())
 
 
-def judge(work: Path, recordings: Path) -> None:
-    """Diagnoses every copy; does not open the labels."""
-    data = saccade.datasets.open(recordings)
-    found: dict[str, Any] = {}
-    for folder in sorted(path for path in work.iterdir() if path.is_dir()):
+@dataclass(frozen=True)
+class Judge:
+    """Diagnoses a copy, in any process."""
+
+    recordings: str
+
+    def __call__(self, folder: str) -> dict[str, Any]:
+        """Verdicts and effects."""
         start = time.perf_counter()
-        report = saccade.diagnose(saccade.Policy.from_pretrained(folder), data)
-        found[folder.name] = {
+        policy = saccade.Policy.from_pretrained(folder, num_threads=1)
+        report = saccade.diagnose(policy, saccade.datasets.open(self.recordings))
+        return {
             "verdicts": {
                 name: [one.name, round(one.effect, 4), round(one.low, 4), round(one.high, 4)]
                 for name, one in report.inputs.items()
@@ -84,9 +90,18 @@ def judge(work: Path, recordings: Path) -> None:
             },
             "seconds": round(time.perf_counter() - start, 1),
         }
-        print(folder.name, {name: one[0] for name, one in found[folder.name]["verdicts"].items()}, flush=True)
-    about = {"episodes": len(data), "recordings": data.fingerprint(), "code": code_version()}
-    write_json(work / "verdicts.json", {**about, "checkpoints": found})
+
+
+def judge(work: Path, recordings: Path, jobs: int) -> None:
+    """Diagnoses every copy; does not open the labels."""
+    data = saccade.datasets.open(recordings)
+    about = {"code": code_version(), "episodes": len(data), "recordings": data.fingerprint()}
+    folders = sorted(str(path) for path in work.iterdir() if path.is_dir())
+    found = {}
+    for folder, one in each(Judge(str(recordings)), folders, Workers(jobs=jobs)):
+        found[Path(folder).name] = one
+        print(Path(folder).name, {name: verdict[0] for name, verdict in one["verdicts"].items()}, flush=True)
+    write_json(work / "verdicts.json", {**about, "checkpoints": dict(sorted(found.items()))})
 
 
 def unseal(work: Path, seal: str, out: Path) -> None:
@@ -119,6 +134,7 @@ def main() -> None:
     judged = parts.add_parser("judge")
     judged.add_argument("work", type=Path)
     judged.add_argument("recordings", type=Path)
+    judged.add_argument("--jobs", type=int, default=1)
     opened = parts.add_parser("open")
     opened.add_argument("work", type=Path)
     opened.add_argument("seal", help="that `make` printed")
@@ -127,7 +143,7 @@ def main() -> None:
     if args.part == "make":
         make(args.work, args.checkpoints)
     elif args.part == "judge":
-        judge(args.work, args.recordings)
+        judge(args.work, args.recordings, args.jobs)
     else:
         unseal(args.work, args.seal, args.out)
 

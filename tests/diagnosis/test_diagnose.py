@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,7 @@ from saccade.diagnosis.changes import Neighbours, camera_of, changed, replacemen
 from saccade.diagnosis.effects import measure_episode
 from saccade.diagnosis.plan import default_episodes, partners_of, planned, steps_of
 from saccade.observations import ParsedObservation, read
+from saccade_lab.random_checkpoint.whole import small_backbone, small_head, write
 from tests.helpers.recorded_cases import Recorded, demo_policy, made_up
 
 LENGTHS = (9, 5, 8, 1, 12)
@@ -221,3 +223,17 @@ def test_one_episode_has_no_partner(data: Recorded) -> None:
         saccade.diagnose(demo_policy(), Recorded([], {}))
     with pytest.raises(InputError, match="seed"):
         saccade.diagnose(demo_policy(), data, seed=-1)
+
+
+@pytest.mark.parametrize("version", ["n1.6", "n1.7"])
+def test_other_releases_are_evaluated_and_diagnosed(version: str, tmp_path: Path) -> None:
+    """Heads without future tokens, whose blocks see text or images, and that denoise more than they give."""
+    write(tmp_path / "small", version, backbone=small_backbone(version), head=small_head(version), seed=1)
+    policy = Policy.from_pretrained(tmp_path / "small", num_threads=1)
+    data = made_up((2, 1), policy=policy)
+    report = saccade.evaluate(policy, data)
+    assert report.horizon == 16 < policy.head.config.action_horizon
+    found = saccade.diagnose(policy, data)
+    assert set(found.inputs) == {"instruction", "camera.front", "camera.wrist", "state"}
+    assert all(one.share.value > 0 for one in found.edges.values())
+    assert set(found.edges) == {"text", "images"}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from typing import Any
 
@@ -9,7 +10,7 @@ import numpy as np
 import pytest
 
 import saccade
-from saccade import InputError, ShapeError
+from saccade import InputError, Policy, ShapeError
 from saccade.evaluation import Evaluation
 from tests.helpers.recorded_cases import Recorded, by_the_policy, demo_policy, made_up
 
@@ -239,3 +240,48 @@ def test_one_key_of_the_whole_width_is_the_action(data: Recorded, report: Evalua
     whole = [np.concatenate(parts, -1) for parts in zip(*data.done.values(), strict=True)]
     found = saccade.evaluate(demo_policy(), Recorded(data.seen, {"action": whole}), stride=4)
     assert found.mse == report.mse
+
+
+class InLerobotsForm(Recorded):
+    """The recordings as lerobot's policies take them."""
+
+    def observation(self, episode: int, step: int, form: str = "isaac") -> dict[str, Any]:
+        assert form == "lerobot"
+        given = self.seen[episode][step]
+        (told,) = given["language"].values()
+        return {
+            **{
+                f"observation.images.{name}": frames[0].transpose(0, 3, 1, 2)
+                for name, frames in given["video"].items()
+            },
+            "observation.state": np.concatenate([part[0] for part in given["state"].values()], axis=-1),
+            "task": told[0][0],
+        }
+
+
+def test_policies_of_lerobot_are_asked_in_their_form(data: Recorded) -> None:
+    whole = demo_policy()
+    pipeline: Any = object()  # that there is one says that lerobot trained the policy
+    policy = Policy(
+        whole.head,
+        dataclasses.replace(whole.normalizer, pipeline=pipeline),
+        backbone=whole.backbone,
+        processor=whole.processor,
+        requirements=whole.requirements,
+    )
+    given = InLerobotsForm(
+        data.seen, {"action": [np.concatenate(one, -1) for one in zip(*data.done.values(), strict=True)]}
+    )
+    found = saccade.evaluate(policy, given, stride=4)
+    expected = policy.act(given.observation(0, 4, "lerobot"), seed=(0, 0, 4))
+    assert np.array_equal(found.predictions[0].predicted[1, 0], expected[0])
+    assert np.array_equal(found.predictions[0].recorded, given.done["action"][0])
+
+
+def test_a_data_set_is_read_for_the_policy(data: Recorded, report: Evaluation) -> None:
+    class Wide(Recorded):
+        def for_policy(self, policy: Policy) -> Recorded:
+            assert policy is demo_policy()
+            return data
+
+    assert saccade.evaluate(demo_policy(), Wide([], {}), stride=4).mse == report.mse

@@ -118,7 +118,7 @@ def _effects(
     alone = policy.encode(observation, previous=both)
     for change, variant in of_state:
         found[name_of(change)] = answers.effect(base, answers.of(alone.context, [variant])[0])
-    for name, cut in _cuts(alone):
+    for name, cut in _cuts(alone, policy.head.config.num_future_tokens):
         found[f"|{name}|"] = answers.effect(base, answers.of(alone.context, [observation], cut)[0])
     # Every effect has a place, also one that is not possible here.
     order = [f"|{NOISE}|", f"|{OBSERVATION}|", *(name_of(change) for change, _ in variants)]
@@ -164,15 +164,16 @@ class _Answers:
         return float(np.mean(apart**2)), np.array(by_key)
 
 
-def _cuts(context: PolicyContext) -> list[tuple[str, Intervention]]:
+def _cuts(context: PolicyContext, num_future_tokens: int) -> list[tuple[str, Intervention]]:
     """The edges from text tokens and from image tokens to all rows of the head."""
     if context.context.image_mask is None:
         return []
     is_image = np.asarray(context.context.image_mask)[0]
+    readers = [name for name in ROW_GROUPS if name != "future" or num_future_tokens]
     found = []
     for name, chosen in ((TEXT, ~is_image), (IMAGES, is_image)):
         places = tuple(int(place) for place in np.flatnonzero(chosen))
         if places:
-            cut = [(reader, ("vl", places)) for reader in ROW_GROUPS]
+            cut = [(reader, ("vl", places)) for reader in readers]
             found.append((name, Intervention(cut=cut)))
     return found
