@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -99,6 +100,7 @@ class Session:
     workers: Workers
     out: Path
     record_to: Path | None = None
+    recordings: Path | None = None  # where they wait until all are there
     done: list[Rolled] = field(default_factory=list)
     lost: list[str] = field(default_factory=list)
 
@@ -139,7 +141,9 @@ class Session:
                 with write_atomically(self.out / rolled.episode.video) as temporary:
                     temporary.write_bytes(rolled.video)
             picture = rolled.picture if seed in self.seeds[:COLUMNS] else None
-            self.done.append(Rolled(rolled.episode, picture, recording=rolled.recording))
+            self.done.append(Rolled(rolled.episode, picture))
+            if self.recordings is not None and rolled.recording is not None:
+                (self.recordings / f"{task}-{seed}").write_bytes(rolled.recording)
             self.done.sort(key=lambda one: order[one.episode.task, one.episode.seed])
             write_json(self.out / "results.json", self.record())
             on_episode(rolled)
@@ -164,18 +168,19 @@ def run(args: argparse.Namespace) -> int:
     if args.video:
         writable_directory(session.out / "videos")
     interrupted = False
-    try:
-        roll_out(session)
-    except KeyboardInterrupt:
-        interrupted = True
-    finally:
-        environment_cache.close()
+    with tempfile.TemporaryDirectory(prefix="saccade-rollout-") as folder:
+        session.recordings = None if args.record is None else Path(folder)
+        try:
+            roll_out(session)
+            write_recordings_of(session)
+        except KeyboardInterrupt:
+            interrupted = True
+        finally:
+            environment_cache.close()
     write_json(session.out / "results.json", session.record())
     pictures = [(rolled.episode, rolled.picture) for rolled in session.done if rolled.picture is not None]
     if pictures:
         write_contact_sheet(pictures, session.out / "contact-sheet.png")
-    if session.record_to is not None and session.done and not interrupted:
-        write_recordings_of(session)
     if args.json:
         output.print_json(session.record(), indent=2)
     else:
@@ -214,16 +219,17 @@ def prepare(args: argparse.Namespace, seeds: range, workers: Workers) -> Session
 
 
 def write_recordings_of(session: Session) -> None:
-    """Writes the data set."""
+    """Writes the data set, if one is wanted and there are episodes."""
     from saccade_lab.sim.environment import SIMULATION_HZ
     from saccade_lab.sim.recordings import Recording, write_recordings
 
-    assert session.record_to is not None
-    config = session.policy.config
-    contents = [rolled.recording for rolled in session.done]
+    folder, config = session.recordings, session.policy.config
+    if session.record_to is None or folder is None or not session.done:
+        return
+    names = [f"{rolled.episode.task}-{rolled.episode.seed}" for rolled in session.done]
     write_recordings(
         session.record_to,
-        (Recording.from_bytes(content) for content in contents if content is not None),
+        (Recording.from_bytes((folder / name).read_bytes()) for name in names),
         [camera.name for camera in config.cameras],
         config.image_size,
         SIMULATION_HZ,

@@ -91,6 +91,32 @@ def download(name: str, commit: str, files: tuple[str, ...], listed: list[str], 
     return Path(folder)
 
 
+def download_dataset(name: str, revision: str | None, argument: str) -> Path:
+    """Downloads a data set as a whole, and returns the directory of its commit in the cache.
+
+    Without a connection, what the cache has of the revision is returned.
+
+    Raises:
+        FileNotFoundError: There is no such data set or revision, or it cannot be downloaded.
+        PermissionError: Access is denied.
+        OSError: A file cannot be written.
+    """
+    SACCADE.require("huggingface_hub")
+    from huggingface_hub import snapshot_download
+
+    try:
+        return Path(snapshot_download(name, repo_type="dataset", revision=revision, library_name="saccade"))
+    except _errors() as error:
+        refused = _refusal(error, name, revision or "main", argument)
+        if refused is not None:
+            raise refused from error
+        if isinstance(error, OSError) and error.errno is not None and not isinstance(error, ConnectionError):
+            raise
+        raise FileNotFoundError(
+            f"{argument}: {name}: no such path{neighbour(name)}, and it cannot be downloaded ({_line(error)})"
+        ) from error
+
+
 def _errors() -> tuple[type[BaseException], ...]:
     """What ``huggingface_hub`` raises: its 1.x uses httpx, whose errors are not OSErrors, before requests."""
     from huggingface_hub.errors import HfHubHTTPError

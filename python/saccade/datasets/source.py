@@ -6,7 +6,7 @@ import os
 from pathlib import Path
 
 from saccade._internal import hub
-from saccade._internal.extras import SACCADE
+from saccade._internal.hub_download import download_dataset
 from saccade.errors import InputError
 
 
@@ -20,6 +20,7 @@ def folder_of(path_or_id: str | os.PathLike[str], revision: str | None = None) -
     Raises:
         InputError: ``path_or_id`` is neither, or ``revision`` is given with a path.
         FileNotFoundError: The id or revision does not exist, or cannot be downloaded.
+        PermissionError: The Hub denies access.
     """
     try:
         text = os.fspath(path_or_id)
@@ -35,13 +36,4 @@ def folder_of(path_or_id: str | os.PathLike[str], revision: str | None = None) -
     name, own = published
     if own is not None and revision is not None:
         raise InputError(f"revision: expected None with {text}, which names one, got {revision!r}")
-    SACCADE.require("huggingface_hub")
-    from huggingface_hub import snapshot_download
-
-    try:
-        return Path(snapshot_download(name, repo_type="dataset", revision=revision or own))
-    except Exception as error:  # its errors have no common base: those of requests, httpx and its own
-        line = str(error).strip().splitlines()[:1] or [type(error).__name__]
-        raise FileNotFoundError(
-            f"path_or_id: {text}: no such folder, and no data set on the Hub: {line[0]}"
-        ) from error
+    return download_dataset(name, revision or own, "path_or_id")
