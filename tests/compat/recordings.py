@@ -59,7 +59,7 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("lerobot") / "data"
     made = LeRobotDataset.create("saccade/test", FPS, features(), root=root, use_videos=True)
     if hasattr(made.meta, "update_chunk_settings"):
-        made.meta.update_chunk_settings(chunks_size=2, video_files_size_in_mb=0.2, data_files_size_in_mb=0.2)
+        made.meta.update_chunk_settings(chunks_size=2, video_files_size_in_mb=0.05, data_files_size_in_mb=0.2)
     rng = np.random.default_rng(0)
     for number, length in enumerate(LENGTHS):
         for step in range(length):

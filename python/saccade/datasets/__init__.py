@@ -5,7 +5,8 @@
 - ``opening``, ``source``: the folder, and what it is read as.
 - ``metadata`` with ``features``: what the data set says about itself, in any version.
 - ``modality``, ``selection``: which numbers and cameras the keys are, and which of them a policy takes.
-- ``dataset`` with ``parquet``, ``videos`` and ``forms``: steps, frames and observations.
+- ``stored`` with ``parquet`` and ``videos``: columns and frames, as they are recorded.
+- ``dataset`` with ``forms``: observations, states and actions.
 - ``writing``, ``encoding``: a data set of version 3.0.
 - ``statistics``: by lerobot's rules.
 """

@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import io
-import threading
-from collections import OrderedDict
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -14,21 +11,18 @@ import numpy as np
 import numpy.typing as npt
 
 from saccade._internal.arrays import Float32Array, UInt8Array, integer
-from saccade._internal.extras import SACCADE
 from saccade._internal.files import sha256_of
 from saccade.datasets import forms
-from saccade.datasets.features import Episode, Metadata
+from saccade.datasets.features import Episode
 from saccade.datasets.modality import ANNOTATION, TASK, Columns, Modality, plain
-from saccade.datasets.parquet import Steps, read_steps
 from saccade.datasets.selection import Part, Selection, selection_of
-from saccade.datasets.videos import TOLERANCE, Frame, Videos
+from saccade.datasets.stored import Stored
+from saccade.datasets.videos import Frame
 from saccade.errors import DatasetError, InputError
 from saccade.observations.pictures import ObservingPolicy
 
 #: The largest number that float32 can hold.
 LARGEST = float(np.finfo(np.float32).max)
-#: Episodes whose steps are kept in memory.
-MOST_EPISODES = 4
 
 
 class Dataset:
@@ -45,13 +39,11 @@ class Dataset:
         version: Version of the format, such as ``"v3.0"``.
     """
 
-    def __init__(self, metadata: Metadata, modality: Modality, selection: Selection) -> None:
-        self._metadata = metadata
+    def __init__(self, stored: Stored, modality: Modality, selection: Selection) -> None:
+        self._stored = stored
+        self._metadata = stored.metadata
         self._modality = modality
         self._selection = selection
-        self._videos = Videos()
-        self._cache: OrderedDict[tuple[int, str], Any] = OrderedDict()
-        self._lock = threading.Lock()
 
     @property
     def episodes(self) -> tuple[Episode, ...]:
@@ -124,7 +116,7 @@ class Dataset:
         keys = self._modality
         if policy.normalizer.pipeline is not None:
             keys = plain(self._metadata.features, keys.where)
-        return self._with(keys, selection_of(policy, keys))
+        return Dataset(self._stored, keys, selection_of(policy, keys))
 
     def observation(self, episode: int, step: int, form: str = "isaac") -> dict[str, Any]:
         """The observation at a step, as :meth:`saccade.Policy.act` takes it, with a batch axis of one.
@@ -194,16 +186,16 @@ class Dataset:
         """
         place = self._place(episode, step)
         column = self._modality.language[self.language_key]
-        given = self._steps(episode).values(column)[place]
+        given = self._stored.steps(episode).values(column)[place]
         if isinstance(given, list) and len(given) == 1:  # features of shape (1,) may be lists
             given = given[0]
         if isinstance(given, str):
             return given
         text = self._metadata.tasks.get(given) if type(given) is int else None
         if text is None:
+            where = self._stored.steps(episode).where
             raise DatasetError(
-                f"{self._steps(episode).where}, step {place}: {column}: expected the index of a task or a "
-                f"text, got {given!r:.60}"
+                f"{where}, step {place}: {column}: expected the index of a task or a text, got {given!r:.60}"
             )
         return text
 
@@ -234,19 +226,10 @@ class Dataset:
         """
         if camera not in self._modality.video:
             raise InputError(f"camera: expected one of {', '.join(self._modality.video)}, got {camera!r}")
-        place = self._place(episode, step)
-        feature = self._metadata.features[self._modality.video[camera]]
-        where = f"{self._metadata.root}: episode {self.episodes[episode].index}, step {place}, {feature.key}"
-        if feature.is_depth:
+        place, key = self._place(episode, step), self._modality.video[camera]
+        if self._metadata.features[key].is_depth:
             raise InputError(f"camera: expected colours, got the depth map {camera!r}")
-        time = self._time(episode, place)
-        if feature.dtype == "image":
-            found = Frame(self._image(episode, place, feature.key, where), time)
-        else:
-            part = self.episodes[episode].videos[feature.key]
-            found = self._videos.frame(where, self.root / part.file, part.start + time, part.start)
-        _check_shape(where, found.pixels, feature.shape)
-        return found
+        return self._stored.frame(episode, place, key)
 
     def column(self, episode: int, name: str) -> npt.NDArray[Any]:
         """A column of numbers as it was recorded, ``(steps, width)``, of the type that it has.
@@ -260,7 +243,7 @@ class Dataset:
         if feature is None or feature.is_camera:
             known = ", ".join(key for key, one in self._metadata.features.items() if not one.is_camera)
             raise InputError(f"name: expected a column, one of {known}, got {name!r}")
-        return self._column(episode, name)
+        return self._stored.column(episode, name)
 
     def noise(self, episode: int, step: int, shape: tuple[int, ...]) -> Float32Array | None:
         """The noise that a policy computed the chunk of a step from, if `saccade rollout` recorded it.
@@ -281,9 +264,9 @@ class Dataset:
         place = self._place(episode, step)
         if not {"noise_seed", "chunk_step"} <= set(self._metadata.features):
             return None
-        if self._column(episode, "chunk_step")[place, 0]:
+        if self._stored.column(episode, "chunk_step")[place, 0]:
             return None
-        *seed, draw = self._column(episode, "noise_seed")[place].tolist()
+        *seed, draw = self._stored.column(episode, "noise_seed")[place].tolist()
         rng = np.random.default_rng(seed)
         for _ in range(draw):
             rng.standard_normal(shape, dtype=np.float32)
@@ -294,19 +277,24 @@ class Dataset:
         """Recorded statistics by modality, key and name: ``statistics["action"]["arm"]["mean"]``.
 
         Empty if the data set has none.
+
+        Raises:
+            DatasetError: They have another shape than the data, or are not finite.
         """
         found: dict[str, dict[str, dict[str, npt.NDArray[np.float64]]]] = {"state": {}, "action": {}}
         recorded = self._metadata.statistics or {}
         for kind, keys in (("state", self._modality.state), ("action", self._modality.action)):
             for key in getattr(self._selection, kind).keys:
                 columns = keys[key]
-                numbers = recorded.get(columns.column)
-                if numbers is not None:
-                    found[kind][key] = {
-                        name: np.asarray(value, np.float64)[columns.numbers]
-                        for name, value in numbers.items()
-                        if name != "count"
-                    }
+                for name, value in recorded.get(columns.column, {}).items():
+                    shape = self._metadata.features[columns.column].shape
+                    if name != "count" and (value.shape != shape or not np.isfinite(value).all()):
+                        raise DatasetError(
+                            f"{self.root / 'meta'}: statistics: {columns.column}: {name}: expected finite "
+                            f"numbers of shape {shape}, got shape {value.shape}"
+                        )
+                    if name != "count":
+                        found[kind].setdefault(key, {})[name] = value[columns.numbers]
         return found
 
     def fingerprint(self) -> str:
@@ -318,12 +306,6 @@ class Dataset:
                     digest.update(f"{path.relative_to(self.root).as_posix()}\0{sha256_of(path)}\n".encode())
         return digest.hexdigest()
 
-    def __getstate__(self) -> dict[str, Any]:
-        return {"metadata": self._metadata, "modality": self._modality, "selection": self._selection}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__init__(**state)  # type: ignore[misc]
-
     def _observation(self, episode: int, step: int, form: str) -> dict[str, Any]:
         frames = {camera: self._history(episode, step, camera) for camera in self.cameras}
         text = self.instruction(episode, step)
@@ -333,17 +315,11 @@ class Dataset:
         """The data set with lerobot's names, and the history of this one."""
         keys = plain(self._metadata.features, self._modality.where)
         seen = self._selection
-        video, state = (
-            Part(tuple(keys.video), seen.video.indices),
-            Part(tuple(keys.state), seen.state.indices),
+        video = Part(tuple(keys.video), seen.video.indices)
+        state = Part(tuple(keys.state), seen.state.indices)
+        return Dataset(
+            self._stored, keys, Selection(video, state, Part(tuple(keys.action), seen.action.indices), None)
         )
-        return self._with(keys, Selection(video, state, Part(tuple(keys.action), seen.action.indices), None))
-
-    def _with(self, modality: Modality, selection: Selection) -> Dataset:
-        """The data set with other keys, which shares what is open and read."""
-        found = Dataset(self._metadata, modality, selection)
-        found._videos, found._cache, found._lock = self._videos, self._cache, self._lock
-        return found
 
     def _place(self, episode: int, step: int) -> int:
         """The step, after checking that both are there."""
@@ -373,13 +349,13 @@ class Dataset:
     ) -> dict[str, npt.NDArray[np.floating[Any]]]:
         """The numbers of keys at steps relative to one."""
         place = self._place(episode, step)
-        steps = self._steps(episode)
+        steps = self._stored.steps(episode)
         wanted = place + np.asarray(indices)
         inside = np.clip(wanted, 0, len(steps) - 1)
         found = {}
         for key in keys:
             columns = known[key]
-            rows = self._column(episode, columns.column)[inside, columns.numbers]
+            rows = self._stored.column(episode, columns.column)[inside, columns.numbers]
             is_good = np.abs(rows) <= LARGEST  # false for NaN
             if not is_good.all():
                 bad = int(inside[~is_good.all(axis=1)][0])
@@ -392,103 +368,3 @@ class Dataset:
                 rows[wanted != inside] = 0
             found[key] = rows
         return found
-
-    def _column(self, episode: int, name: str) -> npt.NDArray[Any]:
-        """A column of an episode, ``(steps, width)``."""
-        steps = self._steps(episode)
-        values = steps.numbers(name)
-        expected = self._metadata.features[name].shape
-        if (values.shape[1],) != expected:
-            raise DatasetError(
-                f"{steps.where}: {name}: expected {expected[0]} numbers a step, as info.json says, got "
-                f"{values.shape[1]}"
-            )
-        return values
-
-    def _time(self, episode: int, step: int) -> float:
-        """The time of a step in its episode, seconds: ``timestamp``, or what follows from the frame rate."""
-        steps = self._steps(episode)
-        return float(steps.numbers("timestamp")[step, 0]) if "timestamp" in steps.names else step / self.fps
-
-    def _steps(self, episode: int) -> Steps:
-        """The steps of an episode without its images, checked."""
-        about = self.episodes[episode]
-        images = {key for key, feature in self._metadata.features.items() if feature.dtype == "image"}
-
-        def read() -> Steps:
-            found = read_steps(self.root / about.file, about.index, lambda name: name not in images)
-            _check_steps(found, about, self.fps)
-            return found
-
-        steps: Steps = self._cached((episode, ""), read)
-        return steps
-
-    def _image(self, episode: int, step: int, key: str, where: str) -> UInt8Array:
-        """A frame that is stored as a picture in the Parquet file."""
-        about = self.episodes[episode]
-
-        def read() -> list[Any]:
-            found = read_steps(self.root / about.file, about.index, lambda name: name == key).values(key)
-            if len(found) != about.length:
-                raise DatasetError(f"{where}: expected {about.length} pictures, got {len(found)}")
-            return found
-
-        stored = self._cached((episode, key), read)[step]
-        content = stored.get("bytes") if isinstance(stored, Mapping) else None
-        if not isinstance(content, bytes):
-            raise DatasetError(f"{where}: expected the bytes of a picture, got {stored!r:.60}")
-        SACCADE.require("PIL")
-        from PIL import Image
-
-        try:
-            with Image.open(io.BytesIO(content)) as picture:
-                return np.asarray(picture.convert("RGB"))
-        # Pillow raises SyntaxError and others for files that are damaged in their own ways.
-        except (OSError, ValueError, SyntaxError, EOFError, Image.DecompressionBombError) as error:
-            raise DatasetError(f"{where}: cannot be read as a picture: {error}") from None
-
-    def _cached(self, key: tuple[int, str], read: Any) -> Any:
-        with self._lock:
-            if key in self._cache:
-                self._cache.move_to_end(key)
-                return self._cache[key]
-        found = read()
-        with self._lock:
-            self._cache[key] = found
-            while len(self._cache) > MOST_EPISODES:
-                self._cache.popitem(last=False)
-        return found
-
-
-def _check_steps(steps: Steps, about: Episode, fps: float) -> None:
-    """The table has the steps that the metadata say, in order, at the frame rate."""
-    if len(steps) != about.length:
-        raise DatasetError(
-            f"{steps.where}: expected {about.length} steps, as the metadata say, got {len(steps)}"
-        )
-    if "frame_index" in steps.names:
-        wrong = np.flatnonzero(steps.numbers("frame_index")[:, 0] != np.arange(len(steps)))
-        if len(wrong):
-            raise DatasetError(
-                f"{steps.where}, step {wrong[0]}: frame_index: expected the steps in order from 0"
-            )
-    if "timestamp" in steps.names:
-        times = steps.numbers("timestamp")[:, 0].astype(np.float64)
-        # float32 cannot hold later times more exactly.
-        allowed = TOLERANCE + np.spacing(times[1:].astype(np.float32)).astype(np.float64)
-        wrong = np.flatnonzero(~(np.abs(np.diff(times) - 1 / fps) <= allowed))
-        if len(wrong) or not np.isfinite(times).all():
-            step = int(wrong[0]) + 1 if len(wrong) else 0
-            raise DatasetError(
-                f"{steps.where}, step {step}: timestamp: expected {1 / fps:.6f} s after the step before "
-                f"(within {TOLERANCE} s), got {times[step]:.6f} s after {times[max(step - 1, 0)]:.6f} s"
-            )
-
-
-def _check_shape(where: str, pixels: UInt8Array, shape: tuple[int, ...]) -> None:
-    """A frame has the shape that ``info.json`` says, where colours may come first or last."""
-    height, width, _ = pixels.shape
-    if len(shape) != 3 or shape not in ((height, width, 3), (3, height, width)):
-        raise DatasetError(
-            f"{where}: expected a frame of shape {shape}, as info.json says, got {pixels.shape}"
-        )

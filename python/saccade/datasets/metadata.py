@@ -214,7 +214,8 @@ def _by_episode(meta: Path) -> Statistics | None:
         return None
     rows = [row.get("stats") for row in _json_lines(path)]
     try:
-        return aggregate([_arrays(row) for row in rows])
+        with np.errstate(all="ignore"):  # numbers that are not finite are refused when they are asked for
+            return aggregate([_arrays(row) for row in rows])
     except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise DatasetError(f"{path}: statistics of an unknown form ({error!r})") from None
 
@@ -270,8 +271,9 @@ def _episode_3(info: Info, where: str, row: Mapping[str, Any]) -> Episode:
         path = info.path("video_path", video_key=key, **places(f"videos/{key}"))
         videos[key] = VideoPart(path, float(start))
     length = _integer(f"{where}: length", row.get("length"), 1)
-    start, stop = row.get("dataset_from_index"), row.get("dataset_to_index")
-    if start is not None and stop is not None and stop - start != length:
+    names = ("dataset_from_index", "dataset_to_index")
+    start, stop = (_integer(f"{where}: {name}", row.get(name)) for name in names)
+    if stop - start != length:
         raise DatasetError(f"{where}: expected {length} steps, its length, got indices {start} to {stop}")
     tasks = _texts(f"{where}: tasks", row.get("tasks"))
     return Episode(index, length, tasks, info.path("data_path", **places("data")), videos)

@@ -14,6 +14,7 @@ from saccade.datasets.metadata import read_metadata
 from saccade.datasets.modality import plain, read_modality
 from saccade.datasets.selection import SelectionLike, read_selection
 from saccade.datasets.source import folder_of
+from saccade.datasets.stored import Stored
 from saccade.errors import DatasetError
 
 
@@ -63,7 +64,7 @@ def open(
         keys = read_modality(given, metadata.features, "modality")
     else:
         keys = read_modality(_json(Path(given)), metadata.features, str(given))
-    return Dataset(metadata, keys, read_selection(data_config, keys))
+    return Dataset(Stored(metadata), keys, read_selection(data_config, keys))
 
 
 def _json(path: Path) -> Mapping[str, Any]:
