@@ -131,6 +131,7 @@ class ActionHead:
         future_refresh: int | None,
         previous_chunk: _Float32 | None,
         chunking: tuple[int, int, float, int | None] | None,
+        guidance: tuple[float, Context] | None,
         intervention: list[_Intervention],
         out: _Float32,
     ) -> None: ...

@@ -246,12 +246,7 @@ def report(out: Path) -> None:
                     "" if without is None else verdict(pair.difference),
                 ]
                 print(f"| {' | '.join(cells)} |")
-                if (
-                    not agrees
-                    and weight == PRIMARY
-                    and policy.startswith("confounded")
-                    and "seed-0" in policy
-                ):
+                if not agrees and weight == PRIMARY and policy in TESTED:
                     tests.append((f"{policy}, without {without}", pair.p_value))
     corrected = holm([p for _, p in tests])
     for (name, p), after in zip(tests, corrected, strict=True):

@@ -54,6 +54,7 @@ class MemoryPolicy:
         batches: The sizes of the batches of which features were computed.
         chunkings: The `Chunking` of each call of `sample`, or None.
         steps: The number of Euler steps of each call of `sample`, or None.
+        weights: The guidance of each call of `sample`, or None.
         gate: Features are computed once it is set.
         begun: The sizes of the batches that have come to the gate.
         nbytes: Size of its backbone.
@@ -64,6 +65,7 @@ class MemoryPolicy:
     begun: list[int] = field(default_factory=list)
     chunkings: list[Any] = field(default_factory=list)
     steps: list[int | None] = field(default_factory=list)
+    weights: list[float | None] = field(default_factory=list)
     gate: threading.Event = field(default_factory=threading.Event)
     nbytes: int = 1 << 32
 
@@ -100,6 +102,8 @@ class MemoryPolicy:
         context: Any = encoded.context
         self.chunkings.append(options.get("chunking"))
         self.steps.append(options.get("num_steps"))
+        self.weights.append(options.get("guidance"))
+        assert (encoded.without is None) == (options.get("guidance") is None)
         state = np.concatenate([parsed.state[:, -1] for parsed in observations])
         actions = options["noise"] + state[:, None] + context[:, None, None].astype(np.float32)
         if options.get("chunking") is not None:

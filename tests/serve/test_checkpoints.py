@@ -110,6 +110,28 @@ def test_an_answer_has_the_same_bits_alone_and_among_others(layout: str, size: s
         assert_same(chunk, whole.act(flat(seen) if seed % 2 else seen, seed=seed))
 
 
+@pytest.mark.parametrize("layout", LAYOUTS)
+@pytest.mark.usefixtures("size")
+def test_guided_answers_are_those_of_act(layout: str) -> None:
+    whole = policy(layout)
+    without: Any = "empty" if layout.startswith("n1") else "default"
+
+    def act(seed: int) -> Any:
+        weight = {} if seed == 1 else {"guidance": 0.5 * seed}
+        with Client(port=running.port) as client:
+            return client.get_action(nested(layout, 1), {"seed": seed, **weight})[0]
+
+    with (
+        serving(whole, guidance=2.5, without=without, max_batch=8, max_wait_ms=500.0) as running,
+        ThreadPoolExecutor(4) as threads,
+    ):
+        together = list(threads.map(act, range(4)))
+    for seed, chunk in enumerate(together):
+        weight = 2.5 if seed == 1 else 0.5 * seed
+        expected = whole.act(nested(layout, 1), seed=seed, guidance=weight, without=without)
+        assert_same(chunk, expected)
+
+
 @pytest.mark.parametrize("layout", ["nvidia", "n17"])
 def test_sessions_are_real_time_chunking(layout: str) -> None:
     whole, first_seen, second_seen = policy(layout), nested(layout, 0), nested(layout, 1)

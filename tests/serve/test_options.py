@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 import shutil
 from collections.abc import Sequence
@@ -119,6 +120,59 @@ def test_steps_out_of_range_are_refused(value: Any, message: str) -> None:
     listener = bind("127.0.0.1", 0)
     with listener, pytest.raises(InputError, match=r"^num_steps: expected"):
         Server(MemoryPolicy(), listener, MemoryLog(), num_steps=value)  # type: ignore[arg-type]
+
+
+def test_the_guidance_of_the_server_and_of_a_request() -> None:
+    with serving(guidance=3.0) as running, Client(port=running.port) as client:
+        for options in ({}, {"guidance": 0}, {"guidance": 1}, {"guidance": 1.5}, {"guidance": None}):
+            assert told(client, **options)["applied_options"] == {
+                name: value for name, value in options.items() if value is not None
+            }
+        client.call("get_action", flat_observation())
+        assert running.policy.weights == [3.0, 0.0, None, 1.5, 3.0, 3.0]
+        # Features of the words, and of the observation without them where they are needed.
+        assert running.policy.batches == [1, 1, 1, 1, 1, 1, 1, 1, 1, 1, 1]
+    with serving() as running, Client(port=running.port) as client:
+        client.get_action(observation())
+        assert running.policy.weights == [None]
+
+
+@pytest.mark.parametrize("value", [-1, math.nan, math.inf, 1e39, "2", True, [2.0]], ids=str)
+def test_guidance_that_is_no_weight_is_refused(value: Any) -> None:
+    with serving() as running, Client(port=running.port) as client:
+        with pytest.raises(ServerError, match=r"^(options: guidance: expected a finite number|request)"):
+            client.get_action(observation(), {"guidance": value})
+        assert running.policy.batches == []
+    listener = bind("127.0.0.1", 0)
+    with listener, pytest.raises(InputError, match=r"^guidance: expected a finite number"):
+        Server(MemoryPolicy(), listener, MemoryLog(), guidance=value)  # type: ignore[arg-type]
+    with listener, pytest.raises(InputError, match=r"^without: expected 'default' or 'empty', got 'no'"):
+        Server(MemoryPolicy(), listener, MemoryLog(), without="no")  # type: ignore[arg-type]
+
+
+def test_requests_with_other_weights_are_sampled_apart() -> None:
+    policy = MemoryPolicy()
+    policy.gate.clear()
+    weights = [None, 2, 0.5, 2, 1, 0.5]
+    with serving(policy) as running, ExitStack() as stack:
+        clients = [stack.enter_context(requester(running.port, zmq.DEALER)) for _ in weights]
+        for number, client in enumerate(clients):
+            post(client, get_action(observation(number), seed=number, guidance=weights[number]))
+            if number == 0:  # it is being computed, and waits no more
+                wait_until(lambda: policy.begun == [1])
+        policy.gate.set()
+        applied = [answer(client)[1]["applied_options"] for client in clients]
+    assert policy.batches == [1, 5, 4]
+    assert sorted(policy.weights[1:], key=str) == [0.5, 2.0, None]
+    assert [one.get("guidance") for one in applied] == weights
+
+
+def test_a_request_without_words_gets_an_error_and_the_others_actions() -> None:
+    bare = {key: value for key, value in observation().items() if key != "language"}
+    with serving() as running, Client(port=running.port) as client:
+        with pytest.raises(ServerError, match=r"^guidance: expected an instruction"):
+            client.get_action(bare, {"guidance": 2.0})
+        client.get_action(observation(), {"guidance": 2.0})
 
 
 def test_requests_with_other_steps_are_sampled_apart() -> None:

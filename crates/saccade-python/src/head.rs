@@ -7,8 +7,8 @@ use numpy::{PyArrayDyn, PyReadonlyArrayDyn, PyReadwriteArrayDyn, PyUntypedArrayM
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 use saccade_vla::{
-    Chunking, FeatureBatch, Features, Group, Integrator, Keep, LoadOptions, NoisyActions, Precision,
-    Sampling, TraceOptions,
+    Chunking, FeatureBatch, Features, Group, Guidance, Integrator, Keep, LoadOptions, NoisyActions,
+    Precision, Sampling, TraceOptions,
 };
 
 use crate::arrays::{Mask, Named, PyTensors, copied_to_numpy, optional_view, owned_to_numpy, view, view_mut};
@@ -160,6 +160,7 @@ impl ActionHead {
         future_refresh: Option<usize>,
         previous_chunk: Option<PyReadonlyArrayDyn<'_, f32>>,
         chunking: Option<(usize, usize, f64, Option<usize>)>,
+        guidance: Option<(f64, PyRef<'_, Context>)>,
         intervention: Vec<PyIntervention<'_>>,
         mut out: PyReadwriteArrayDyn<'_, f32>,
     ) -> PyResult<()> {
@@ -175,6 +176,10 @@ impl ActionHead {
                 horizon,
             },
         );
+        let guidance = guidance.map(|(weight, without)| (weight, Arc::clone(&without.0)));
+        let guidance = guidance
+            .as_ref()
+            .map(|&(weight, ref without)| Guidance { without, weight });
         let interventions = interventions(intervention)?;
         let sampling = Sampling {
             num_steps,
@@ -182,6 +187,7 @@ impl ActionHead {
             num_samples,
             future_refresh,
             chunking,
+            guidance,
             interventions: &interventions,
         };
         call(py, || {

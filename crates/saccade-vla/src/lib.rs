@@ -58,6 +58,7 @@ pub use error::{Error, ErrorKind, Problem, Result};
 pub use head::action_head::ActionHead;
 pub use head::context::Context;
 pub use head::encode::Features;
+pub use head::guidance::Guidance;
 pub use head::load::LoadOptions;
 pub use head::plan::tensor_shapes;
 pub use head::sample::Sampling;

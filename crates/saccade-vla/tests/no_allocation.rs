@@ -6,7 +6,7 @@ use std::alloc::{GlobalAlloc, Layout, System};
 use std::sync::atomic::{AtomicUsize, Ordering};
 
 use common::{Inputs, released};
-use saccade_vla::{Array, ArrayMut, Chunking, Sampling};
+use saccade_vla::{Array, ArrayMut, Chunking, Guidance, Sampling};
 
 struct Counting;
 
@@ -42,6 +42,7 @@ fn the_second_sample_of_a_shape_allocates_nothing() {
         let config = head.config();
         let (horizon, width) = (config.action_horizon, config.encoder_action_dim);
         let context = Inputs::new(&head, &[1, 3], 50).context;
+        let without = Inputs::new(&head, &[1, 3], 45).context;
         let (state, noise) = (
             vec![0.2; 2 * config.state_dim],
             vec![0.3; 2 * 3 * horizon * width],
@@ -49,7 +50,7 @@ fn the_second_sample_of_a_shape_allocates_nothing() {
         let previous_chunk = vec![0.4; 2 * horizon * width];
         let shape = [2, horizon, width];
         let mut out = vec![0.0; 2 * 3 * horizon * config.action_dim];
-        let mut sample = |future_refresh: Option<usize>, is_chunked: bool| {
+        let mut sample = |future_refresh: Option<usize>, is_chunked: bool, is_guided: bool| {
             let chunking = Chunking {
                 previous_chunk: Array::new(&previous_chunk, &shape).unwrap(),
                 overlap: 4,
@@ -61,6 +62,10 @@ fn the_second_sample_of_a_shape_allocates_nothing() {
                 num_samples: Some(3),
                 future_refresh,
                 chunking: is_chunked.then_some(chunking),
+                guidance: is_guided.then_some(Guidance {
+                    without: &without,
+                    weight: 2.0,
+                }),
                 ..Sampling::default()
             };
             head.sample(
@@ -73,10 +78,14 @@ fn the_second_sample_of_a_shape_allocates_nothing() {
             )
             .unwrap();
         };
-        for (future_refresh, is_chunked) in [(None, false), (Some(3), true)] {
-            sample(future_refresh, is_chunked);
+        for (future_refresh, is_chunked, is_guided) in [
+            (None, false, false),
+            (Some(3), true, false),
+            (Some(2), true, true),
+        ] {
+            sample(future_refresh, is_chunked, is_guided);
             let before = ALLOCATIONS.load(Ordering::Relaxed);
-            sample(future_refresh, is_chunked);
+            sample(future_refresh, is_chunked, is_guided);
             assert_eq!(
                 ALLOCATIONS.load(Ordering::Relaxed),
                 before,

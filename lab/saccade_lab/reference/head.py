@@ -10,6 +10,7 @@ sequence (H state rows, N future rows, T action rows), S the vision-language tok
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Iterable, Mapping, Sequence
 from os import PathLike
 from typing import Any
@@ -30,6 +31,7 @@ from saccade.head.trace import Trace
 from saccade_lab.reference import loading
 from saccade_lab.reference.checks import as_embodiment, check_shape
 from saccade_lab.reference.chunking import start_of
+from saccade_lab.reference.guidance import Guidance
 from saccade_lab.reference.intervene import Mask, Run, removal_bias, token_mask
 from saccade_lab.reference.layers import (
     NORM_EPS,
@@ -292,6 +294,7 @@ class ActionHead(nn.Module):
         future_refresh: int | None = None,
         previous_chunk: Tensor | np.ndarray | None = None,
         chunking: Chunking | None = None,
+        guidance: Guidance | None = None,
         drop_vl: Mask = None,
         attention_mask: Mask = None,
         image_mask: Mask = None,
@@ -313,6 +316,8 @@ class ActionHead(nn.Module):
                 Required with ``chunking``.
             chunking: How this chunk continues the previous one. ``velocity_strength`` is the factor of the
                 velocity, in both evaluations of a midpoint step.
+            guidance: A second context and a weight w: the velocity is u + w (v - u), where u is that of the
+                second context, at every evaluation.
             drop_vl, attention_mask, image_mask, intervention, stop_gradient: As in ``trace``. All evaluations
                 of a step belong to that step. A patch of rows at a step where they are not always computed is
                 an error.
@@ -325,21 +330,24 @@ class ActionHead(nn.Module):
             InputError: A value is out of range, or an intervention does not fit the head.
         """
         vl_embs = self.as_input(vl_embs)
-        run = Run(
+        run_of = functools.partial(
+            Run,
             self.config,
-            vl_embs,
             num_steps=num_steps,
             in_step=INTEGRATORS[check_integrator(integrator)],
             future_refresh=1 if future_refresh is None else integer("future_refresh", future_refresh),
-            drop_vl=drop_vl,
-            attention_mask=attention_mask,
-            image_mask=image_mask,
             intervention=intervention,
             stop_gradient=stop_gradient,
         )
+        run = run_of(vl_embs, drop_vl=drop_vl, attention_mask=attention_mask, image_mask=image_mask)
+        second = None
+        if guidance is not None:
+            embs = self.as_input(guidance.vl_embs)
+            masks = {name: getattr(guidance, name) for name in ("drop_vl", "attention_mask", "image_mask")}
+            second = (guidance.weight, run_of(embs, **masks), embs)
         previous = None if previous_chunk is None else self.as_input(previous_chunk)
         start, strength = start_of(self.as_input(noise), previous, chunking, self.config)
-        return self.follow(run, vl_embs, state, embodiment_id, start, strength)
+        return self.follow(run, vl_embs, state, embodiment_id, start, strength, second)
 
     def trace(
         self,
@@ -411,11 +419,13 @@ class ActionHead(nn.Module):
         embodiment_id: int | Tensor | np.ndarray,
         start: Tensor,
         strength: Tensor | None = None,
+        second: tuple[float, Run, Tensor] | None = None,
     ) -> Tensor:
         """The steps of ``sample`` from ``start (B, T, encoder_action_dim)`` to ``(B, T, action_dim)``.
 
-        ``strength (T, 1)`` multiplies the velocity. If the head decodes fewer dimensions than it encodes, the
-        others are kept at 0.
+        ``strength (T, 1)`` multiplies the velocity. ``second`` is the weight of a guidance, and the run and
+        the tokens of its context. If the head decodes fewer dimensions than it encodes, the others are kept
+        at 0.
         """
         config = self.config
         check_shape("noise", start, (len(vl_embs), config.action_horizon, config.encoder_action_dim))
@@ -425,6 +435,10 @@ class ActionHead(nn.Module):
             time = evaluation / (run.num_steps * run.in_step)
             bucket = int(time * config.num_timestep_buckets)
             direction = self.velocity_in(run, evaluation, vl_embs, state, embodiment_id, actions, bucket)
+            if second is not None:
+                weight, other, embs = second
+                away = self.velocity_in(other, evaluation, embs, state, embodiment_id, actions, bucket)
+                direction = away + weight * (direction - away)
             return F.pad(direction if strength is None else strength * direction, rest)
 
         actions = F.pad(start[..., : config.action_dim], rest)

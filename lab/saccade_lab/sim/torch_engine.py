@@ -20,7 +20,7 @@ from saccade.head.config import HeadConfig
 from saccade.observations import read_requirements
 from saccade.processor import Processor
 from saccade.robots import Normalizer
-from saccade_lab.reference import ActionHead, Backbone
+from saccade_lab.reference import ActionHead, Backbone, Guidance
 
 
 @dataclass(frozen=True)
@@ -84,6 +84,9 @@ class TorchHead:
     def sample(self, context: Any, state: ArrayLike, embodiment_id: Any, **options: Any) -> Float32Array:
         """See ``saccade.ActionHead.sample``; ``noise`` is required, and options that are None are dropped."""
         given = {name: value for name, value in options.items() if value is not None}
+        if "guidance" in given:
+            second = given.pop("without")
+            given["guidance"] = Guidance(given["guidance"], second.vl_embs, second.drop_vl)
         with torch.no_grad():
             found = self._head.sample(
                 context.vl_embs, np.asarray(state), embodiment_id, drop_vl=context.drop_vl, **given

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import argparse
 import os
+from typing import get_args
 
 from saccade._internal import flags as arguments
 from saccade._internal.flags import UsageError, add_policy_options, policy_options
 from saccade.cli import EXIT_INTERRUPTED, EXIT_OK, require
+from saccade.policy.guidance import Without
 from saccade.serve.limits import Limits
 
 HELP = "serve a whole checkpoint to robots and simulators over the network"
@@ -71,6 +73,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     arguments.add_checkpoint_argument(parser)
     add_policy_options(parser)
     arguments.add_num_steps(parser, "Euler steps of requests that do not say it (default: the checkpoint's)")
+    arguments.add_number(
+        parser,
+        "--guidance",
+        minimum=0,
+        help="weight of the instruction in requests that do not say it: above 1 the policy follows it more "
+        "than by itself, below 1 less (default: 1, which costs nothing; others take up to twice the time)",
+    )
+    parser.add_argument(
+        "--without",
+        choices=get_args(Without),
+        default="default",
+        help="what guidance compares with: the release's default for a missing instruction, or an empty one "
+        "(default: default)",
+    )
     arguments.add_num_threads(parser, "threads (default: the physical cores)")
     served = parser.add_argument_group("server")
     served.add_argument(
@@ -155,7 +171,9 @@ def run(args: argparse.Namespace) -> int:
     listener = bind(args.host, args.port)  # before minutes may be spent on loading
     policy = Policy.from_pretrained(args.checkpoint, **policy_options(args))
     # What a first call sets up is not left to the first client.
-    policy.act(policy.example_observation(), seed=0, num_steps=args.num_steps)
+    without = None if args.guidance is None else args.without
+    example = policy.example_observation()
+    policy.act(example, seed=0, num_steps=args.num_steps, guidance=args.guidance, without=without)
     log = open_log(args.log)
     try:
         server = Server(
@@ -168,6 +186,8 @@ def run(args: argparse.Namespace) -> int:
             max_wait_ms=args.max_wait_ms,
             seed=args.seed,
             num_steps=args.num_steps,
+            guidance=args.guidance,
+            without=args.without,
             api_token=args.api_token,
             allow_kill=args.allow_kill,
             modality_form=args.modality_form,

@@ -26,6 +26,7 @@ from saccade.head.context import Context
 from saccade.head.intervention import Intervention
 from saccade.head.loading import LoadedHead
 from saccade.head.options import (
+    check_guidance,
     check_integrator,
     noise_or_draw,
     optional_integer,
@@ -122,6 +123,8 @@ class ActionHead(LoadedHead):
         intervention: Intervention | Sequence[Intervention] | None = None,
         previous_chunk: ArrayLike | None = None,
         chunking: Chunking | None = None,
+        guidance: float | None = None,
+        without: Context | None = None,
         out: ArrayLike | None = None,
     ) -> Array:
         """Samples chunks of actions by integrating the velocity from noise.
@@ -152,6 +155,13 @@ class ActionHead(LoadedHead):
             previous_chunk: ``(batch, rows, action_dim)`` as the head returned it (or ``encoder_action_dim``
                 wide), with ``chunking.horizon`` to ``action_horizon`` rows. All samples continue this chunk.
             chunking: How the chunk continues the previous one. Required with ``previous_chunk`` only.
+            guidance: A weight w of at least 0. With the velocities v of ``context`` and u of ``without`` at
+                the same actions, sampling follows ``u + w (v - u)``, at every evaluation: classifier-free
+                guidance. None and 1 sample ``context`` alone, with the same bits as without guidance; 0 has
+                the result of ``without``; other weights take twice the time. Interventions act in both.
+            without: A context of the same observations, such as one without their instructions, from
+                :meth:`encode` of this head. Required with ``guidance`` other than 1. It may have another
+                number of vision-language tokens.
             out: The array that the result is written to and that is returned: writable, float32,
                 C-contiguous, of the shape of the result.
 
@@ -161,7 +171,8 @@ class ActionHead(LoadedHead):
 
         Raises:
             ShapeError, DtypeError, InputError: An argument does not fit the head or is not finite, both
-                ``noise`` and ``seed`` are given, or only one of ``previous_chunk`` and ``chunking`` is given.
+                ``noise`` and ``seed`` are given, or only one of ``previous_chunk`` and ``chunking``, or of
+                ``guidance`` and ``without``, is given.
             MemoryError: There is not enough memory.
         """
         held = _held(context)
@@ -180,6 +191,7 @@ class ActionHead(LoadedHead):
             samples,
             optional_integer("future_refresh", future_refresh),
             *plain_chunking(previous_chunk, chunking, output),
+            _guidance(guidance, without),
             plain_interventions(intervention),
             output,
         )
@@ -330,6 +342,22 @@ def _held(context: Context) -> _saccade.Context:
     if not isinstance(context, Context):
         raise InputError(f"context: expected what encode returns, got {type(context).__name__}")
     return context._held
+
+
+def _guidance(guidance: float | None, without: Context | None) -> tuple[float, _saccade.Context] | None:
+    """Weight and second context as the engine takes them; None where the first context counts alone."""
+    if without is None:
+        if check_guidance(guidance) is not None:
+            raise InputError(
+                f"guidance, without: expected both or neither, got guidance {guidance!r} without a context"
+            )
+        return None
+    if guidance is None:
+        raise InputError("guidance, without: expected both or neither, got without alone")
+    if not isinstance(without, Context):
+        raise InputError(f"without: expected what encode returns, got {type(without).__name__}")
+    weight = check_guidance(guidance)
+    return 1.0 if weight is None else weight, without._held
 
 
 def _converted(arrays: dict[Any, Float32Array], use_torch: bool) -> dict[Any, Array]:

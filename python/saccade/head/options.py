@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import numbers
 from collections.abc import Mapping, Sequence
 from typing import Any, TypedDict
 
@@ -17,6 +19,10 @@ PARTS = ("backbone", "head")
 
 #: Velocity evaluations in one step of each integrator.
 INTEGRATORS = {"euler": 1, "midpoint": 2}
+
+
+#: The largest number that the engine computes with, float32's.
+LARGEST = float(np.finfo(np.float32).max)
 
 
 class LoadOptions(TypedDict, total=False):
@@ -39,6 +45,24 @@ def check_integrator(integrator: object) -> str:
     if not isinstance(integrator, str) or integrator not in INTEGRATORS:
         raise InputError(f"integrator: expected {' or '.join(INTEGRATORS)}, got {integrator!r}")
     return integrator
+
+
+def check_guidance(guidance: object) -> float | None:
+    """The weight of a guidance. None and 1, which is without one, are None.
+
+    Raises:
+        InputError: It is not a finite number of at least 0.
+    """
+    if guidance is None:
+        return None
+    is_number = isinstance(guidance, numbers.Real) and not isinstance(guidance, bool)
+    try:
+        weight = float(guidance) if is_number else math.nan  # type: ignore[arg-type]
+    except OverflowError:
+        weight = math.inf
+    if not 0 <= weight <= LARGEST:
+        raise InputError(f"guidance: expected a finite number of at least 0, got {guidance!r}")
+    return None if weight == 1 else weight
 
 
 def optional_integer(name: str, value: int | None) -> int | None:

@@ -12,5 +12,6 @@ If processor, backbone and head are saccade's own, steps 2 and 3 are one call of
 features do not become arrays. Otherwise they are called one after the other.
 
 ``loading`` loads the parts from a checkpoint and checks that they fit each other, ``interfaces`` has what a
-policy requires of head and backbone, ``example`` makes an observation to try.
+policy requires of head and backbone, ``guidance`` makes observations without their words, ``example`` one to
+try.
 """

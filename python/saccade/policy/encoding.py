@@ -6,7 +6,7 @@ If processor, backbone and head are saccade's own, steps 2 and 3 are one call of
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, TypeGuard, TypeVar
 
 import numpy as np
@@ -20,6 +20,7 @@ from saccade.errors import InputError
 from saccade.head.context import Context
 from saccade.head.head import ActionHead
 from saccade.observations import ParsedObservation
+from saccade.policy.guidance import Without, named, without_words
 from saccade.policy.interfaces import Head, VisionLanguageBackbone
 from saccade.policy.preparing import prepare_inputs
 from saccade.processor import Processor
@@ -38,6 +39,7 @@ class PolicyContext:
         context: The head's context: the keys and values of its cross-attention. ``batch`` observations, those
             with fewer tokens than the longest padded, and the padding dropped.
         features: The backbone's features of each observation, a batch of one each.
+        without: The same observations without their instructions, for guidance, or None.
 
     Example:
         >>> import saccade
@@ -50,6 +52,7 @@ class PolicyContext:
 
     context: Context
     features: tuple[BackboneFeatures, ...]
+    without: PolicyContext | None = None
 
     @property
     def batch(self) -> int:
@@ -63,6 +66,27 @@ class PolicyContext:
 
     def __repr__(self) -> str:
         return f"<saccade.PolicyContext batch={self.batch} num_vl_tokens={self.num_vl_tokens}>"
+
+
+def encode_with_and_without(
+    parsed: Sequence[ParsedObservation],
+    without: Without,
+    processor: Processor,
+    backbone: VisionLanguageBackbone,
+    head: Head,
+    previous: PolicyContext | None = None,
+) -> PolicyContext:
+    """As :func:`encode_observations`, and the observations without their words.
+
+    These take views and the common beginning of the prompt from those with words.
+    """
+    bare = without_words(parsed, without, processor)
+    found = encode_observations(parsed, processor, backbone, head, previous)
+    before = getattr(previous, "without", None)
+    known = found if before is None else replace(found, features=(*found.features, *before.features))
+    with named(without):
+        second = encode_observations(bare, processor, backbone, head, known)
+    return replace(found, without=second)
 
 
 def encode_observations(

@@ -62,6 +62,8 @@ class Head(Protocol):
         intervention: Intervention | Sequence[Intervention] | None = None,
         previous_chunk: ArrayLike | None = None,
         chunking: Chunking | None = None,
+        guidance: float | None = None,
+        without: Context | None = None,
     ) -> Array:
         """See :meth:`saccade.ActionHead.sample`. Options that are None are not passed."""
 

@@ -12,9 +12,11 @@ from saccade.errors import InputError
 from saccade.head.chunking import Chunking
 from saccade.head.context import Context
 from saccade.head.intervention import Intervention
+from saccade.head.options import check_guidance
 from saccade.observations import Requirements
-from saccade.policy.encoding import PolicyContext, encode_observations
+from saccade.policy.encoding import PolicyContext, encode_observations, encode_with_and_without
 from saccade.policy.example import example_observation
+from saccade.policy.guidance import Without, check_without
 from saccade.policy.interfaces import Head, VisionLanguageBackbone
 from saccade.policy.loading import check_fit, check_name, embodiment_of, load_parts, read_normalizer
 from saccade.policy.reading import Observations, is_observation, read_observations, read_states
@@ -189,6 +191,8 @@ class Policy:
         intervention: Intervention | Sequence[Intervention] | None = None,
         previous_chunk: Any = None,
         chunking: Chunking | None = None,
+        guidance: float | None = None,
+        without: Without | None = None,
     ) -> Any:
         """Predicts a chunk of actions. Equivalent to :meth:`encode` followed by :meth:`sample`.
 
@@ -198,13 +202,15 @@ class Policy:
         Args:
             observation, previous: As in :meth:`encode`.
             noise, seed, num_steps, integrator, num_samples, future_refresh, intervention, previous_chunk,
-                chunking: As in :meth:`sample`.
+                chunking, guidance: As in :meth:`sample`.
+            without: As in :meth:`encode`. Default: ``"default"`` if ``guidance`` needs it.
 
         Returns:
             As :meth:`sample` with an observation.
 
         Raises:
-            InputError, ShapeError, DtypeError: As :meth:`encode` and :meth:`sample`.
+            InputError, ShapeError, DtypeError: As :meth:`encode` and :meth:`sample`; or ``without`` is given
+                and ``guidance`` is not.
         """
         processor, backbone = self._require_backbone()
         options = Sampling(
@@ -217,15 +223,28 @@ class Policy:
             intervention=intervention,
             previous_chunk=previous_chunk,
             chunking=chunking,
+            guidance=check_guidance(guidance),
         )
+        if without is not None:
+            check_without(without)
+            if guidance is None:
+                raise InputError(f"without: expected guidance with it, got {without!r} alone")
         batch = read_observations(observation, self.requirements)
-        encoded = encode_observations(batch, processor, backbone, self.head, previous)
-        actions = sample_actions(
-            encoded.context, batch, options, self.head, self.normalizer, self.embodiment_id
-        )
+        parts = (processor, backbone, self.head, previous)
+        if options.guidance is None:
+            encoded = encode_observations(batch, *parts)
+        else:
+            encoded = encode_with_and_without(batch.parsed, without or "default", *parts)
+        actions = sample_actions(encoded, batch, options, self.head, self.normalizer, self.embodiment_id)
         return restore_units(actions, batch, self.normalizer)
 
-    def encode(self, observation: Observations, *, previous: PolicyContext | None = None) -> PolicyContext:
+    def encode(
+        self,
+        observation: Observations,
+        *,
+        previous: PolicyContext | None = None,
+        without: Without | None = None,
+    ) -> PolicyContext:
         """Encodes camera frames and instruction.
 
         Args:
@@ -244,15 +263,23 @@ class Policy:
             previous: The context of earlier observations of this policy. Vision tokens of views with the same
                 frames, and the unchanged beginning of a prompt, are taken from it. The result has the same
                 bits without.
+            without: Also encodes the observations without their instructions, for ``guidance`` in
+                :meth:`sample`: with ``"default"``, what the release has for a missing instruction, which
+                Isaac-GR00T N1.6 and N1.7 do not have; or with ``"empty"``, an empty one. Vision tokens and
+                the common beginning of the prompt are computed once.
 
         Raises:
             InputError, ShapeError, DtypeError: The observation does not fit the robot; the message lists what
-                the robot needs. Or this policy has no backbone, or ``previous`` does not fit.
+                the robot needs. Or this policy has no backbone, or ``previous`` does not fit. With
+                ``without``: an observation has no instruction, or the release has no such default.
             MemoryError: There is not enough memory.
         """
         processor, backbone = self._require_backbone()
         batch = read_observations(observation, self.requirements)
-        return encode_observations(batch, processor, backbone, self.head, previous)
+        parts = (processor, backbone, self.head, previous)
+        if without is None:
+            return encode_observations(batch, *parts)
+        return encode_with_and_without(batch.parsed, without, *parts)
 
     def sample(
         self,
@@ -268,6 +295,7 @@ class Policy:
         intervention: Intervention | Sequence[Intervention] | None = None,
         previous_chunk: Any = None,
         chunking: Chunking | None = None,
+        guidance: float | None = None,
     ) -> Any:
         """Samples chunks of the robot's actions.
 
@@ -285,6 +313,10 @@ class Policy:
                 robot's action is zero, as in training.
             chunking: How the chunk continues the previous one. Its ``horizon`` is the normalizer's
                 ``action_horizon`` by default.
+            guidance: A weight w of at least 0. Sampling follows ``v(without the words) + w (v(with them) -
+                v(without them))``, where v is the velocity of the flow; see
+                :meth:`saccade.ActionHead.sample`. None and 1 are without guidance. Other weights need a
+                context from ``encode`` with ``without``.
 
         Returns:
             float32 in the robot's units. The horizon T is the normalizer's ``action_horizon``, if it has one,
@@ -309,12 +341,12 @@ class Policy:
             intervention=intervention,
             previous_chunk=previous_chunk,
             chunking=chunking,
+            guidance=check_guidance(guidance),
         )
-        held = context.context if isinstance(context, PolicyContext) else context
         if not is_observation(observation_or_state):
-            return self._sample_state(held, observation_or_state, options)  # type: ignore[arg-type]
+            return self._sample_state(context, observation_or_state, options)  # type: ignore[arg-type]
         batch = read_states(observation_or_state, self.requirements)  # type: ignore[arg-type]
-        actions = sample_actions(held, batch, options, self.head, self.normalizer, self.embodiment_id)
+        actions = sample_actions(context, batch, options, self.head, self.normalizer, self.embodiment_id)
         return restore_units(actions, batch, self.normalizer)
 
     def __call__(
@@ -384,7 +416,7 @@ class Policy:
         """
         return example_observation(self.requirements, self.normalizer, integer("seed", seed, least=0))
 
-    def _sample_state(self, context: Context, state: ArrayLike, options: Sampling) -> Array:
+    def _sample_state(self, context: PolicyContext | Context, state: ArrayLike, options: Sampling) -> Array:
         actions = sample_state(context, state, options, self.head, self.normalizer, self.embodiment_id)
         return self.normalizer.actions(actions, state)
 

@@ -14,6 +14,8 @@ from saccade.head.chunking import Chunking
 from saccade.head.context import Context
 from saccade.head.intervention import Intervention
 from saccade.observations import ParsedState
+from saccade.policy.encoding import PolicyContext
+from saccade.policy.guidance import check_guides
 from saccade.policy.interfaces import Head
 from saccade.policy.reading import Batch
 from saccade.robots import Normalizer, padded
@@ -32,10 +34,12 @@ class Sampling:
     intervention: Intervention | Sequence[Intervention] | None = None
     previous_chunk: Any = None
     chunking: Chunking | None = None
+    guidance: float | None = None
+    without: Context | None = None  # the second context, if guidance needs one
 
 
 def sample_actions(
-    context: Context,
+    context: PolicyContext | Context,
     batch: Batch[ParsedState],
     options: Sampling,
     head: Head,
@@ -55,7 +59,7 @@ def sample_actions(
 
 
 def sample_state(
-    context: Context,
+    context: PolicyContext | Context,
     state: ArrayLike,
     options: Sampling,
     head: Head,
@@ -65,8 +69,23 @@ def sample_state(
     """Normalised actions for a state in the robot's units."""
     if options.previous_chunk is not None:
         options = _continued(options, state, head, normalizer)
+    if options.guidance is not None:
+        options = replace(options, without=_second(context, head))
     given = {name: value for name, value in vars(options).items() if value is not None}
-    return head.sample(context, normalizer.state(state), embodiment_id, **given)
+    held = context.context if isinstance(context, PolicyContext) else context
+    return head.sample(held, normalizer.state(state), embodiment_id, **given)
+
+
+def _second(context: PolicyContext | Context, head: Head) -> Context:
+    """The second context of a guided call."""
+    check_guides(head)
+    second = context.without if isinstance(context, PolicyContext) else None
+    if second is None:
+        raise InputError(
+            "guidance: expected a context from encode(observation, without='default') or 'empty', got one "
+            "without a second context"
+        )
+    return second.context
 
 
 def _joined_chunks(given: Any, batch: Batch[ParsedState], normalizer: Normalizer) -> Any:

@@ -29,6 +29,7 @@ class Job:
     received: float = field(default_factory=time.perf_counter)
     is_claimed: bool = False  # a thread has begun to prepare it while it waits
     inputs: Sequence[Any] = ()  # what the backbone takes, once it is prepared
+    bare_inputs: Sequence[Any] = ()  # with guidance, the same without the words
     actions: Any = None
     info: Mapping[str, Any] = field(default_factory=dict)  # what is returned with the actions
     batch: int = 0  # number of observations that were computed together

@@ -7,7 +7,7 @@ import threading
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,8 +16,9 @@ import saccade._saccade as _saccade
 from saccade._internal.arrays import Float32Array
 from saccade.errors import InputError
 from saccade.head.chunking import Chunking
-from saccade.head.options import noise_or_draw
+from saccade.head.options import check_guidance, noise_or_draw
 from saccade.policy.encoding import compute_features, encode_features
+from saccade.policy.guidance import Without, named, without_words
 from saccade.policy.preparing import prepare_inputs
 from saccade.serve.batching import Job
 from saccade.serve.requests import CHUNKING, RELEASED_CHUNKING
@@ -47,18 +48,32 @@ class _Work:
     session: Session | None
     continued: tuple[Chunk, Chunking] | None
     num_steps: int | None
+    guidance: float | None
     features: Sequence[Any] = ()
+    bare_features: Sequence[Any] = ()
 
 
 class Engine:
     """Computes batches.
 
+    Args:
+        policy, num_steps, guidance, without: As for :class:`saccade.serve.Server`.
+        sessions: The sessions of the server.
+
     Attributes:
         num_workers: Number of threads that are to call :meth:`run` at the same time, at most.
     """
 
-    def __init__(self, policy: Policy, sessions: Sessions, num_steps: int | None = None) -> None:
+    def __init__(
+        self,
+        policy: Policy,
+        sessions: Sessions,
+        num_steps: int | None = None,
+        guidance: float | None = None,
+        without: Without = "default",
+    ) -> None:
         self._policy, self._sessions, self._num_steps = policy, sessions, num_steps
+        self._guidance, self._without = guidance, without
         self._lock, self._running = threading.Lock(), 0
         if policy.backbone is None or policy.processor is None:
             raise InputError(f"policy: expected a whole policy, got one without a backbone: {policy!r}")
@@ -71,9 +86,18 @@ class Engine:
         if not job.inputs and job.error is None:
             with _timed([job], "inputs"):
                 try:
+                    if self._weight(job) is not None:
+                        bare = without_words([job.parsed], self._without, self._processor)
+                        with named(self._without):
+                            job.bare_inputs = prepare_inputs(bare, self._processor)
                     job.inputs = prepare_inputs([job.parsed], self._processor)
                 except BaseException as error:
                     job.error = error
+
+    def _weight(self, job: Job) -> float | None:
+        """The weight of a request's guidance; None without."""
+        own = job.call.options.guidance
+        return check_guidance(self._guidance if own is None else own)
 
     def run(self, jobs: Sequence[Job]) -> Sequence[Job]:
         """Computes the actions or the error of requests. An error of one does not affect the others."""
@@ -112,7 +136,8 @@ class Engine:
             session = self._sessions.use(options.session, job.client)
             continued = session.continued(options, job.rows)
         noise = noise_or_draw(None, options.seed, shape)
-        return _Work(job, noise, session, continued, options.num_steps or self._num_steps)
+        num_steps = options.num_steps or self._num_steps
+        return _Work(job, noise, session, continued, num_steps, self._weight(job))
 
     def _try(self, works: Sequence[_Work]) -> None:
         """Computes requests together, or if that fails each alone."""
@@ -129,26 +154,42 @@ class Engine:
 
     def _together(self, works: Sequence[_Work]) -> None:
         inputs = [one for work in works for one in work.job.inputs]
+        bare = [one for work in works for one in work.job.bare_inputs]
         with _timed([work.job for work in works], "backbone"):
-            features = iter(compute_features(inputs, self._backbone))
-        groups: dict[tuple[Chunking | None, int | None], list[_Work]] = {}
+            known = compute_features(inputs, self._backbone)
+            # Views and the beginning of the prompt are those of the same observations with their words.
+            second = iter(self._backbone.encode_many(bare, previous=known) if bare else ())
+        features = iter(known)
+        groups: dict[tuple[Chunking | None, int | None, float | None], list[_Work]] = {}
         for work in works:
             work.features = list(itertools.islice(features, len(work.job.inputs)))
+            work.bare_features = list(itertools.islice(second, len(work.job.bare_inputs)))
             chunking = None if work.continued is None else work.continued[1]
-            groups.setdefault((chunking, work.num_steps), []).append(work)
-        for (chunking, num_steps), group in groups.items():
+            groups.setdefault((chunking, work.num_steps, work.guidance), []).append(work)
+        for options, group in groups.items():
             with _timed([work.job for work in group], "head"):
-                self._sample(group, chunking, num_steps, len(inputs))
+                self._sample(group, *options, len(inputs))
 
     def _sample(
-        self, works: Sequence[_Work], chunking: Chunking | None, num_steps: int | None, batch: int
+        self,
+        works: Sequence[_Work],
+        chunking: Chunking | None,
+        num_steps: int | None,
+        guidance: float | None,
+        batch: int,
     ) -> None:
         previous = [work.continued[0].actions for work in works if work.continued is not None]
+        head = self._policy.head
+        context = encode_features([one for work in works for one in work.features], head)
+        if guidance is not None:
+            bare = [one for work in works for one in work.bare_features]
+            context = replace(context, without=encode_features(bare, head))
         found = self._policy.sample(
-            encode_features([one for work in works for one in work.features], self._policy.head),
+            context,
             [work.job.parsed for work in works],
             noise=np.concatenate([work.noise for work in works]),
             num_steps=num_steps,
+            guidance=guidance,
             previous_chunk=previous or None,
             chunking=chunking,
         )

@@ -17,6 +17,7 @@ from typing import Any
 from saccade._internal.arrays import integer
 from saccade.errors import InputError
 from saccade.head.chunking import Chunking
+from saccade.head.options import LARGEST
 
 ENDPOINTS = ("ping", "get_action", "reset", "get_modality_config", "kill")
 #: What the released servers answer, word for word.
@@ -28,7 +29,7 @@ UNAUTHORIZED = "Unauthorized: Invalid API token"
 CHUNKING = ("executed", "frozen", "ramp_rate")
 RELEASED_CHUNKING = ("action_horizon", "rtc_overlap_steps", "rtc_frozen_steps", "rtc_ramp_rate")
 #: The keys of `options` that this server reads.
-OPTIONS = ("seed", "num_steps", "session", *CHUNKING, *RELEASED_CHUNKING)
+OPTIONS = ("seed", "num_steps", "guidance", "session", *CHUNKING, *RELEASED_CHUNKING)
 LONGEST_SESSION = 256
 #: Names of options that were not read, as an answer lists them.
 MOST_IGNORED = 8
@@ -40,6 +41,7 @@ class Options:
 
     seed: int | None = None
     num_steps: int | None = None
+    guidance: float | None = None
     session: str | int | None = None
     #: Number of actions of the session's last chunk that the robot has executed at the observation, if said.
     executed: int | None = None
@@ -149,10 +151,16 @@ def _options(given: Any, num_timestep_buckets: int) -> Options:
             if type(value) not in (int, float) or not math.isfinite(value) or value <= 0:
                 raise InputError(f"options: {name}: expected a finite number above 0, got {value!r:.100}")
             read[name] = float(value)
+        elif name == "guidance":
+            if type(value) not in (int, float) or not 0 <= value <= LARGEST:
+                raise InputError(
+                    f"options: guidance: expected a finite number of at least 0, got {value!r:.100}"
+                )
+            read[name] = float(value)
         else:
             read[name] = integer(f"options: {name}", value, least=0)
     ignored = [str(key)[:LONGEST_SESSION] for key in given if key not in OPTIONS or key in unread]
-    own = {name: read[name] for name in ("seed", "num_steps", *CHUNKING) if name in read}
+    own = {name: read[name] for name in ("seed", "num_steps", "guidance", *CHUNKING) if name in read}
     return Options(
         **own,
         session=session,

@@ -15,6 +15,8 @@ from typing import TYPE_CHECKING, Any
 import saccade.observations as observations
 from saccade._internal.hub import commit_of
 from saccade.errors import InputError, SaccadeError, printable
+from saccade.head.options import check_guidance
+from saccade.policy.guidance import Without, check_without
 from saccade.serve import modalities
 from saccade.serve.batching import Job, Queue
 from saccade.serve.engine import Engine
@@ -57,6 +59,9 @@ class Server:
         max_wait_ms: Time that a request waits for others at most, in milliseconds.
         seed: Seed of the noise of requests that bring none, or None for noise that is different each time.
         num_steps: Number of Euler steps of requests that do not say it, or None for that of the checkpoint.
+        guidance: Weight of the guidance of requests that do not say it, as in :meth:`saccade.Policy.sample`;
+            None for none.
+        without: What stands in place of the instruction for guidance, as in :meth:`saccade.Policy.encode`.
         api_token: A secret that every request must contain, or None.
         allow_kill: Whether a client may stop the server.
         modality_form: How `get_modality_config` is answered to a client that did not show its release:
@@ -68,7 +73,7 @@ class Server:
 
     Raises:
         CheckpointError: A file of the checkpoint is damaged.
-        InputError: ``num_steps`` is out of range.
+        InputError: ``num_steps`` or ``guidance`` is out of range, or ``without`` is unknown.
 
     Example:
         >>> import saccade
@@ -93,6 +98,8 @@ class Server:
         max_wait_ms: float = 5.0,
         seed: int | None = None,
         num_steps: int | None = None,
+        guidance: float | None = None,
+        without: Without = "default",
         api_token: str | None = None,
         allow_kill: bool = False,
         modality_form: str | None = None,
@@ -105,7 +112,8 @@ class Server:
         self._modalities = modalities.answers(policy)
         self._form = modality_form or modalities.form_of(policy.head.config.version)
         self._sessions = Sessions(limits.sessions, limits.session_seconds)
-        self._engine = Engine(policy, self._sessions, num_steps)
+        check_without(without)
+        self._engine = Engine(policy, self._sessions, num_steps, check_guidance(guidance), without)
         self.num_workers = min(self._engine.num_workers, max_batch)
         self._queue = Queue(max_batch, max_wait_ms / 1e3, self._engine.prepare, self.num_workers)
         self._statistics = Statistics()

@@ -131,6 +131,20 @@ def test_interventions_reach_both_engines(demo: Policy, name: str) -> None:
     np.testing.assert_array_equal(demo.robot_actions(np.asarray(normalised))[0], changed)
 
 
+@pytest.mark.parametrize("without", ["default", "empty"])
+def test_guidance_reaches_both_engines(demo: Policy, without: Any) -> None:
+    other = Policy.from_pretrained(engine="torch", num_threads=1)
+    observation = demo.observation(seen(demo, fill=90))
+    noise = demo.noise(np.random.default_rng(4))
+    chunks = [
+        policy.whole.act(observation, noise=noise, guidance=3.0, without=without) for policy in (demo, other)
+    ]
+    plain = demo.whole.act(observation, noise=noise)
+    for key, chunk in chunks[0].items():
+        np.testing.assert_allclose(chunk, chunks[1][key], atol=2e-4)
+        assert np.abs(chunk - plain[key]).max() > 1e-2
+
+
 def test_an_intervention_that_does_not_fit_is_refused(demo: Policy) -> None:
     observation = seen(demo)
     noise = demo.noise(np.random.default_rng(0))

@@ -9,6 +9,7 @@ use saccade_vla_kernels::{Rows, RowsMut};
 
 use super::action_head::ActionHead;
 use super::dit::{ActiveRows, Pass};
+use super::guidance::Guided;
 use super::workspace::Workspace;
 use crate::alloc::reserve;
 use crate::array::not_finite;
@@ -77,6 +78,7 @@ impl ActionHead {
     pub(super) fn integrate(
         &self,
         pass: &Pass<'_>,
+        guided: Option<&Guided<'_>>,
         steps: Steps,
         recorded: &mut Recorded<StepBlock>,
         workspace: &mut Workspace,
@@ -96,7 +98,11 @@ impl ActionHead {
             } else {
                 pass.rows
             };
-            self.evaluate(&Pass { step, rows, ..*pass }, |_| timestep, recorded, workspace)?;
+            let pass = &Pass { step, rows, ..*pass };
+            self.evaluate(pass, |_| timestep, recorded, workspace)?;
+            if let Some(guided) = guided {
+                self.guide(guided, pass, workspace)?;
+            }
             let Workspace {
                 x,
                 start,
@@ -159,7 +165,7 @@ impl ActionHead {
 
     /// `[state, future, action]` for each sequence, or those of them that run, to the transformer's residual
     /// stream.
-    fn assemble_rows(&self, pass: &Pass<'_>, workspace: &mut Workspace) -> Result<()> {
+    pub(super) fn assemble_rows(&self, pass: &Pass<'_>, workspace: &mut Workspace) -> Result<()> {
         let Workspace {
             state, action, input, ..
         } = workspace;
@@ -190,7 +196,7 @@ impl ActionHead {
     }
 
     /// The transformer, and the velocity that the decoders make of its output rows, to `workspace.velocity`.
-    fn decode(
+    pub(super) fn decode(
         &self,
         pass: &Pass<'_>,
         recorded: &mut Recorded<StepBlock>,

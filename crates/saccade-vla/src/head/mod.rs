@@ -11,6 +11,7 @@ mod embodiment_layers;
 pub(crate) mod embodiments;
 pub(crate) mod encode;
 mod flow_matching;
+pub(crate) mod guidance;
 mod layers;
 pub(crate) mod load;
 pub(crate) mod plan;

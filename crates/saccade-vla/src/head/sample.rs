@@ -4,6 +4,7 @@ use super::action_head::ActionHead;
 use super::context::Context;
 use super::dit::{ActiveRows, Pass};
 use super::flow_matching::Steps;
+use super::guidance::Guidance;
 use crate::array::{Array, ArrayMut};
 use crate::error::{Error, Result, problem};
 use crate::inspect::compiled::CompiledInterventions;
@@ -33,8 +34,11 @@ pub struct Sampling<'a> {
     pub future_refresh: Option<usize>,
     /// The previous chunk, and how this one begins with its end; none starts from noise alone.
     pub chunking: Option<Chunking<'a>>,
-    /// CompiledInterventions inside the head. Cuts and biases act on the rows that run; a patch of rows that do not is an
-    /// error.
+    /// A second context, and how far the velocity is moved away from that of it; none samples the first
+    /// alone. The velocities of both count at every evaluation.
+    pub guidance: Option<Guidance<'a>>,
+    /// Interventions inside the head, in both contexts of a guided call. Cuts and biases act on the rows that
+    /// run; a patch of rows that do not is an error.
     pub interventions: &'a [Intervention],
 }
 
@@ -92,6 +96,8 @@ impl ActionHead {
         let sizes = self.call_sizes(sampling.interventions, context, num_steps)?;
         let compiled = CompiledInterventions::new(sampling.interventions, sizes)?;
         compiled.check_refresh(steps.refresh, sampling.integrator.evaluations())?;
+        let guidance = sampling.guidance.as_ref();
+        let guided = self.guided(guidance, sampling.interventions, context.batch, num_steps)?;
         let pass = Pass {
             context,
             samples,
@@ -103,7 +109,7 @@ impl ActionHead {
             self.check_embodiments(embodiment_id, context.batch, &mut workspace.embodiment_ids)?;
             self.encode_state(state, workspace)?;
             self.begin(noise.data(), seam.as_ref(), samples, workspace)?;
-            self.integrate(&pass, steps, &mut Recorded::default(), workspace)?;
+            self.integrate(&pass, guided.as_ref(), steps, &mut Recorded::default(), workspace)?;
             self.copy_actions(workspace.x.as_rows(), noise.shape(), out)
         })
     }

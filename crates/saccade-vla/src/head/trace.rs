@@ -17,8 +17,9 @@ impl ActionHead {
     /// As [`Self::sample`], and keeps what goes on inside. All rows are computed in every block, the last
     /// included.
     ///
-    /// There is one chunk for each observation, and all rows run at every step: `sampling.num_samples` and
-    /// `sampling.future_refresh` must be none, and `sampling.integrator` Euler's.
+    /// There is one chunk and one context for each observation, and all rows run at every step:
+    /// `sampling.num_samples`, `sampling.guidance` and `sampling.future_refresh` must be none, and
+    /// `sampling.integrator` Euler's.
     ///
     /// ```
     /// # use saccade_vla::{ActionHead, Array, Features, Keep, LoadOptions, Sampling, TraceOptions};
@@ -79,7 +80,7 @@ impl ActionHead {
             self.check_embodiments(embodiment_id, batch, &mut workspace.embodiment_ids)?;
             self.encode_state(state, workspace)?;
             self.begin(noise.data(), seam.as_ref(), samples, workspace)?;
-            self.integrate(&pass, steps, &mut recorded, workspace)?;
+            self.integrate(&pass, None, steps, &mut recorded, workspace)?;
             let shape = [batch, config.action_horizon, config.action_dim];
             let mut actions = filled("actions", shape.iter().product(), 0.0)?;
             self.copy_actions(workspace.x.as_rows(), noise.shape(), &mut actions)?;
@@ -113,6 +114,11 @@ fn check_traceable(sampling: &Sampling<'_>) -> Result<()> {
     if sampling.integrator != Integrator::Euler {
         return Err(Error::Input(problem!(
             "integrator"; expected "euler, since a trace has one evaluation a step"; got "midpoint"
+        )));
+    }
+    if sampling.guidance.is_some() {
+        return Err(Error::Input(problem!(
+            "guidance"; "expected none, since a trace is of one context"
         )));
     }
     if let Some(refresh) = sampling.future_refresh {

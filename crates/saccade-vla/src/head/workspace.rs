@@ -12,6 +12,8 @@ pub(crate) struct Workspace {
     pub vl: VlWorkspace,
     pub input: DitInput,
     pub dit: DitWorkspace,
+    /// That of the second context of a guided call.
+    pub other_dit: DitWorkspace,
     /// By observation.
     pub embodiment_ids: Vec<usize>,
     /// States of which some are set to zero, `(batch * state_rows, inputs of a state row)`.
@@ -35,5 +37,7 @@ pub(crate) struct Workspace {
     pub decoded: Scratch,
     /// `(batch * samples * action_horizon, action_dim)`.
     pub velocity: Scratch,
+    /// That of the other context of a guided call.
+    pub other_velocity: Scratch,
     pub linear: LinearScratch,
 }
