@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import concurrent.futures
 import dataclasses
 import json
+import os
 import pickle
 import types
 from pathlib import Path
@@ -289,3 +291,23 @@ def test_published_metadata(name: str, tmp_path: Path) -> None:
         assert sum(one.width for one in keys.values()) == column.shape[0]
     assert [known.features[key].dtype for key in found.video.values()] == ["video"] * len(modality["video"])
     assert list(found.language)[1:] == [f"annotation.{key}" for key in modality["annotation"]]
+
+
+def test_threads_and_forks_share_a_data_set(root: Path) -> None:
+    data = saccade.datasets.open(root)
+    places = [(episode, step) for episode in (0, 1, 2) for step in data.episodes[episode].steps]
+    expected = {place: data.frame(*place, "front").pixels for place in places}
+
+    def check(order: list[int]) -> bool:
+        chosen = [places[number] for number in order]
+        return all(np.array_equal(data.frame(*place, "front").pixels, expected[place]) for place in chosen)
+
+    rng = np.random.default_rng(0)
+    orders = [rng.permutation(len(places)).tolist() for _ in range(4)]
+    with concurrent.futures.ThreadPoolExecutor(4) as pool:
+        assert all(pool.map(check, orders))
+    child = os.fork()
+    if not child:  # no cleaning up, which is the parent's
+        os._exit(0 if check(orders[0]) else 1)
+    assert check(orders[1])
+    assert os.waitpid(child, 0)[1] == 0

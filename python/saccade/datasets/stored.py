@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
+import functools
 import io
-import threading
-from collections import OrderedDict
 from collections.abc import Mapping
 from typing import Any
 
@@ -18,7 +17,7 @@ from saccade.datasets.parquet import Steps, read_steps
 from saccade.datasets.videos import TOLERANCE, Frame, Videos
 from saccade.errors import DatasetError
 
-#: Episodes whose steps are kept in memory; the pictures of an episode that has them count as one more.
+#: Episodes whose steps are kept in memory, and columns of pictures of an episode.
 MOST_EPISODES = 4
 
 
@@ -35,8 +34,8 @@ class Stored:
     def __init__(self, metadata: Metadata) -> None:
         self.metadata = metadata
         self._videos = Videos()
-        self._cache: OrderedDict[tuple[int, str], Any] = OrderedDict()
-        self._lock = threading.Lock()
+        self.steps = functools.lru_cache(MOST_EPISODES)(self._read_steps)
+        self._pictures = functools.lru_cache(MOST_EPISODES)(self._read_pictures)
 
     def __getstate__(self) -> dict[str, Any]:
         return {"metadata": self.metadata}
@@ -78,32 +77,25 @@ class Stored:
             else step / self.metadata.fps
         )
 
-    def steps(self, episode: int) -> Steps:
-        """The steps of an episode without its images, checked."""
+    def _read_steps(self, episode: int) -> Steps:
+        """The steps of an episode without its pictures."""
         about = self.metadata.episodes[episode]
-        images = {key for key, feature in self.metadata.features.items() if feature.dtype == "image"}
+        pictures = {key for key, feature in self.metadata.features.items() if feature.dtype == "image"}
+        found = read_steps(self.metadata.root / about.file, about.index, lambda name: name not in pictures)
+        _check_steps(found, about, self.metadata.fps)
+        return found
 
-        def read() -> Steps:
-            found = read_steps(self.metadata.root / about.file, about.index, lambda name: name not in images)
-            _check_steps(found, about, self.metadata.fps)
-            return found
-
-        steps: Steps = self._cached((episode, ""), read)
-        return steps
+    def _read_pictures(self, episode: int, key: str) -> list[Any]:
+        """The pictures of an episode, as they are stored."""
+        about = self.metadata.episodes[episode]
+        steps = read_steps(self.metadata.root / about.file, about.index, lambda name: name == key)
+        if len(steps) != about.length:
+            raise DatasetError(f"{steps.where}: {key}: expected {about.length} pictures, got {len(steps)}")
+        return steps.values(key)
 
     def _image(self, episode: int, step: int, key: str, where: str) -> UInt8Array:
         """A frame that is stored as a picture in the Parquet file."""
-        about = self.metadata.episodes[episode]
-
-        def read() -> list[Any]:
-            found = read_steps(self.metadata.root / about.file, about.index, lambda name: name == key).values(
-                key
-            )
-            if len(found) != about.length:
-                raise DatasetError(f"{where}: expected {about.length} pictures, got {len(found)}")
-            return found
-
-        stored = self._cached((episode, key), read)[step]
+        stored = self._pictures(episode, key)[step]
         content = stored.get("bytes") if isinstance(stored, Mapping) else None
         if not isinstance(content, bytes):
             raise DatasetError(f"{where}: expected the bytes of a picture, got {stored!r:.60}")
@@ -116,18 +108,6 @@ class Stored:
         # Pillow raises SyntaxError and others for files that are damaged in their own ways.
         except (OSError, ValueError, SyntaxError, EOFError, Image.DecompressionBombError) as error:
             raise DatasetError(f"{where}: cannot be read as a picture: {error}") from None
-
-    def _cached(self, key: tuple[int, str], read: Any) -> Any:
-        with self._lock:
-            if key in self._cache:
-                self._cache.move_to_end(key)
-                return self._cache[key]
-        found = read()
-        with self._lock:
-            self._cache[key] = found
-            while len(self._cache) > MOST_EPISODES:
-                self._cache.popitem(last=False)
-        return found
 
 
 def _check_steps(steps: Steps, about: Episode, fps: float) -> None:

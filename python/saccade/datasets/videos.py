@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import threading
+import weakref
 from collections import OrderedDict
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -44,9 +45,9 @@ class Videos:
     """Open videos. Any number of threads may call it; they decode one after the other."""
 
     def __init__(self) -> None:
-        self._lock = threading.Lock()
+        self.lock = threading.Lock()
         self._open: OrderedDict[Path, _Video] = OrderedDict()
-        self._process = os.getpid()
+        ALL.add(self)
 
     def frame(self, where: str, path: Path, time: float, start: float) -> Frame:
         """The frame at a time.
@@ -60,9 +61,7 @@ class Videos:
         Raises:
             DatasetError: There is no frame at this time, or the video is damaged.
         """
-        with self._lock:
-            if self._process != os.getpid():  # after a fork both processes would move one file position
-                self._open, self._process = OrderedDict(), os.getpid()
+        with self.lock:
             try:
                 video = self._open.pop(path, None) or _Video(path)
                 self._open[path] = video
@@ -80,10 +79,9 @@ class Videos:
         return Frame(found[1], found[0] - start)
 
     def close(self) -> None:
-        """Closes all videos."""
-        with self._lock:
-            for path in list(self._open):
-                self._forget(path)
+        """Closes all videos. The caller has the lock."""
+        for path in list(self._open):
+            self._forget(path)
 
     def __getstate__(self) -> dict[str, Any]:
         return {}
@@ -95,6 +93,28 @@ class Videos:
         video = self._open.pop(path, None)
         if video is not None:
             video.container.close()
+
+
+#: What is open in this process, and what is locked while it forks.
+ALL: weakref.WeakSet[Videos] = weakref.WeakSet()
+LOCKED: list[Videos] = []
+
+
+def _before_fork() -> None:
+    """Closes all videos: decoders have threads, which the child lacks and would wait for."""
+    for videos in list(ALL):
+        videos.lock.acquire()
+        LOCKED.append(videos)
+        videos.close()
+
+
+def _after_fork() -> None:
+    while LOCKED:
+        LOCKED.pop().lock.release()
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(before=_before_fork, after_in_parent=_after_fork, after_in_child=_after_fork)
 
 
 class _Video:
