@@ -10,7 +10,7 @@ set -euo pipefail
 cd "$(dirname "$0")/.."
 
 # Tests that take too long in valgrind's emulation are left out; `narrow` takes a minute and a half.
-VALGRIND_TESTS="attention layer_norm linear masks narrow narrow_weights outliers rms_norm rotary_embedding"
+VALGRIND_TESTS="attention key_values layer_norm linear linear_shapes masks narrow narrow_weights outliers rms_norm rotary_embedding"
 # AddressSanitizer reports running out of memory as an error. Under it a test may run for more than a minute; the test
 # runner then prints a warning, which allocates, so the test that counts allocations is skipped too.
 ASAN_SKIPPED="allocates_nothing without_memory cannot_be_had cannot_be_started"

@@ -18,7 +18,7 @@ impl<A: Activation> Kernel for Map<'_, A> {
     type Output = ();
 
     #[inline(always)]
-    fn run<S: Simd>(self, simd: S) {
+    fn run<S: Simd>(&mut self, simd: S) {
         let mut chunks = self.x.chunks_exact_mut(S::LANES);
         for x in &mut chunks {
             simd.store(A::of(simd, simd.load(x)), x);
@@ -30,7 +30,7 @@ impl<A: Activation> Kernel for Map<'_, A> {
 
 fn map<A: Activation>(isa: Isa, x: &mut [f32]) {
     let activation = PhantomData::<A>;
-    isa.run(Map { x, activation });
+    isa.run(&mut Map { x, activation });
 }
 
 /// GELU in its tanh form, `0.5 x (1 + tanh(sqrt(2 / pi) (x + 0.044715 x^3)))`, in place.

@@ -134,30 +134,3 @@ impl<'a, T: Copy> Matrix<'a, T> {
         }
     }
 }
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn a_transposed_matrix_has_the_same_elements() {
-        let data: Vec<u32> = (0..12).collect();
-        let matrix = Matrix::new(&data, 4);
-        let turned = matrix.transpose();
-        assert_eq!((turned.num_rows(), turned.num_columns()), (4, 3));
-        for (row, column) in (0..3).flat_map(|row| (0..4).map(move |column| (row, column))) {
-            assert_eq!(matrix.get(row, column), turned.get(column, row));
-        }
-        assert_eq!(turned.rows(1..3).columns(2..3).get(1, 0), matrix.get(2, 2));
-        assert_eq!(matrix.contiguous_row(1), Some(&data[4..8]));
-        assert_eq!(turned.contiguous_row(1), None);
-    }
-
-    #[test]
-    fn a_matrix_without_columns_has_rows() {
-        let none: [f32; 0] = [];
-        let matrix = Matrix::from(Rows::strided(&none, 3, 0, 0));
-        assert_eq!(matrix.transpose().num_columns(), 3);
-        assert_eq!(matrix.rows(2..3).contiguous_row(0), Some(&none[..]));
-    }
-}

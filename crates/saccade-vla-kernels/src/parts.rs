@@ -18,7 +18,7 @@ const ELEMENTS_PER_TASK: usize = 1 << 13;
 pub(crate) fn parallel_rows<T: Send>(
     threads: usize,
     out: RowsMut<'_, T>,
-    work: &(dyn Fn(Range<usize>, RowsMut<'_, T>) + Sync),
+    work: impl Fn(Range<usize>, RowsMut<'_, T>) + Sync,
 ) {
     let (rows, width) = (out.num_rows(), out.num_columns());
     let (threads, tasks) = threads_and_tasks(threads, rows, width, rows);
@@ -82,7 +82,7 @@ mod tests {
             parallel_rows(
                 3,
                 RowsMut::strided(&mut data, rows, width, width),
-                &|rows, mut out| {
+                |rows, mut out| {
                     assert_eq!((out.num_rows(), out.num_columns()), (rows.len(), width));
                     for (index, row) in rows.enumerate() {
                         out.row_mut(index)

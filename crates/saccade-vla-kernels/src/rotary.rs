@@ -54,9 +54,9 @@ pub fn rotary_embedding(
     if rows == 0 || width == 0 || pairs == 0 {
         return;
     }
-    parallel_rows(threads, x, &|rows, x| {
+    parallel_rows(threads, x, |rows, x| {
         let (cos, sin) = (cos.rows(rows.clone()), sin.rows(rows));
-        isa.run(Rotary {
+        isa.run(&mut Rotary {
             x,
             head_dim,
             cos,
@@ -76,7 +76,7 @@ impl Kernel for Rotary<'_> {
     type Output = ();
 
     #[inline(always)]
-    fn run<S: Simd>(mut self, simd: S) {
+    fn run<S: Simd>(&mut self, simd: S) {
         let angles = self.cos.iter().zip(self.sin.iter());
         for (row, (cos, sin)) in self.x.iter_mut().zip(angles) {
             for head in row.chunks_exact_mut(self.head_dim) {

@@ -2,8 +2,6 @@
 
 mod shape;
 mod shared;
-#[cfg(test)]
-mod tests;
 
 use std::marker::PhantomData;
 use std::mem::MaybeUninit;
@@ -69,18 +67,21 @@ impl<T> Copy for Rows<'_, T> {}
 macro_rules! sizes {
     () => {
         /// Number of rows.
+        #[inline]
         #[must_use]
         pub fn num_rows(&self) -> usize {
             self.shape.num_rows
         }
 
         /// Elements of a row.
+        #[inline]
         #[must_use]
         pub fn num_columns(&self) -> usize {
             self.shape.num_columns
         }
 
         /// Elements from one row to the next.
+        #[inline]
         #[must_use]
         pub fn row_stride(&self) -> usize {
             self.shape.row_stride
@@ -153,6 +154,7 @@ impl<'a, T> Rows<'a, T> {
     }
 
     /// The rows, first to last.
+    #[inline]
     pub fn iter(&self) -> impl ExactSizeIterator<Item = &'a [T]> + use<'a, T> {
         let rows = *self;
         (0..rows.num_rows()).map(move |row| rows.row(row))
@@ -164,6 +166,7 @@ impl<'a, T> Rows<'a, T> {
     /// If not all of them exist.
     #[must_use]
     #[track_caller]
+    #[inline]
     pub fn rows(&self, rows: Range<usize>) -> Self {
         let (shape, start) = self.shape.rows(&rows);
         Self::of(self.first.wrapping_add(start), shape)
@@ -175,6 +178,7 @@ impl<'a, T> Rows<'a, T> {
     /// If not all of them exist.
     #[must_use]
     #[track_caller]
+    #[inline]
     pub fn columns(&self, columns: Range<usize>) -> Self {
         let (shape, start) = self.shape.columns(&columns);
         Self::of(self.first.wrapping_add(start), shape)
@@ -290,6 +294,7 @@ impl<'a, T> RowsMut<'a, T> {
     }
 
     /// The rows, first to last.
+    #[inline]
     pub fn iter_mut(&mut self) -> impl ExactSizeIterator<Item = &mut [T]> {
         let (first, shape) = (self.first, self.shape);
         (0..shape.num_rows).map(move |row| {
@@ -318,6 +323,7 @@ impl<'a, T> RowsMut<'a, T> {
     /// If not all of them exist.
     #[must_use]
     #[track_caller]
+    #[inline]
     pub fn rows(self, rows: Range<usize>) -> Self {
         let (shape, start) = self.shape.rows(&rows);
         Self::of(self.first.wrapping_add(start), shape)
@@ -329,6 +335,7 @@ impl<'a, T> RowsMut<'a, T> {
     /// If not all of them exist.
     #[must_use]
     #[track_caller]
+    #[inline]
     pub fn columns(self, columns: Range<usize>) -> Self {
         let (shape, start) = self.shape.columns(&columns);
         Self::of(self.first.wrapping_add(start), shape)

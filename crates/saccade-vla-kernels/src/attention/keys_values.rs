@@ -159,8 +159,8 @@ impl PackedKeyValues {
                 values_to: values_to.row_mut(0),
             };
             let head_is_finite = match element {
-                Element::Bf16 => isa.run(PackBf16(head)),
-                _ => isa.run(PackF32(head)),
+                Element::Bf16 => isa.run(&mut PackBf16(head)),
+                _ => isa.run(&mut PackF32(head)),
             };
             if !head_is_finite {
                 finite.store(false, Ordering::Relaxed);

@@ -110,7 +110,7 @@ pub fn attention(
                     .map(|weights| weights.block(weights_of_block, 0..len)),
             )
         };
-        let block = QueryBlock {
+        let block = &mut QueryBlock {
             kv,
             queries: queries.rows(rows_of_block.clone()).columns(columns),
             scale,
@@ -122,9 +122,9 @@ pub fn attention(
             weights,
         };
         match kv.element() {
-            Element::Bf16 if kv.isa().has_tiles() => kv.isa().run_tiles(AttendInTiles(block)),
-            Element::Bf16 => kv.isa().run(AttendBf16(block)),
-            _ => kv.isa().run(AttendF32(block)),
+            Element::Bf16 if kv.isa().has_tiles() => kv.isa().run_tiles(&mut AttendInTiles(block)),
+            Element::Bf16 => kv.isa().run(&mut AttendBf16(block)),
+            _ => kv.isa().run(&mut AttendF32(block)),
         }
     });
 }

@@ -28,7 +28,7 @@ impl Kernel for PackF32<'_> {
     type Output = bool;
 
     #[inline(always)]
-    fn run<S: Simd>(self, simd: S) -> bool {
+    fn run<S: Simd>(&mut self, simd: S) -> bool {
         self.0.pack::<S, F32Words>(simd)
     }
 }
@@ -38,7 +38,7 @@ impl Kernel for PackBf16<'_> {
     const USES_DOT_BF16: bool = true;
 
     #[inline(always)]
-    fn run<S: Simd>(self, simd: S) -> bool {
+    fn run<S: Simd>(&mut self, simd: S) -> bool {
         self.0.pack::<S, Bf16Words>(simd)
     }
 }
@@ -116,9 +116,13 @@ impl Words for Bf16Words {
     }
 }
 
+/// Rows that are cache lines: each would lie across two of them otherwise.
+#[repr(align(64))]
+struct Square([[u32; MAX_LANES]; MAX_LANES]);
+
 impl Head<'_> {
     #[inline(always)]
-    fn pack<S: Simd, W: Words>(mut self, simd: S) -> bool {
+    fn pack<S: Simd, W: Words>(&mut self, simd: S) -> bool {
         self.pack_keys::<S, W>(simd);
         self.pack_values::<S, W>(simd)
     }
@@ -132,22 +136,22 @@ impl Head<'_> {
             // Lanes before the first key given stay.
             let (start, end) = (first.saturating_sub(keys.start), S::LANES.min(len - keys.start));
             // The words of as many keys, a row a key, to be transposed; zeros for keys beyond the last one.
-            let mut square = [[0; MAX_LANES]; MAX_LANES];
+            let mut square = Square([[0; MAX_LANES]; MAX_LANES]);
             for step in (0..steps).step_by(S::LANES) {
                 let from = head_dim.min(step * W::STEP);
                 let to = head_dim.min(from + S::LANES * W::STEP);
-                for (lane, words) in square.iter_mut().enumerate().take(end).skip(start) {
+                for (lane, words) in square.0.iter_mut().enumerate().take(end).skip(start) {
                     let key = self.keys.row(keys.start + lane - first);
                     W::along(simd, &key[from..to], words);
                 }
                 let count = S::LANES.min(steps - step);
                 let to = &mut self.keys_to[(panel * steps + step) * S::LANES..][..count * S::LANES];
                 if start == 0 && count == S::LANES {
-                    simd.transpose(&square, to);
+                    simd.transpose(&square.0, to);
                     continue;
                 }
                 for (word, to) in to.chunks_exact_mut(S::LANES).enumerate() {
-                    for (to, row) in to.iter_mut().zip(&square).skip(start) {
+                    for (to, row) in to.iter_mut().zip(&square.0).skip(start) {
                         *to = row[word];
                     }
                 }

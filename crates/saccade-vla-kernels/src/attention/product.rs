@@ -4,6 +4,7 @@ use std::marker::PhantomData;
 
 use super::arithmetic::{Bf16Products, Float32Products, Stored, TileArithmetic};
 use super::mask::Mask;
+use crate::simd::bits::cast;
 use crate::simd::{Kernel, Simd};
 use crate::tiles::{Ahead, MAX_COLUMN_TILES, Operation, Product, Session, TILE, TileUnit};
 
@@ -28,15 +29,18 @@ pub(super) struct Operands {
     pub add: bool,
 }
 
-/// A product whose operands exist.
-pub(super) struct AttentionProduct(Operands);
+/// A product whose operands exist, as the arithmetic `A` reads them.
+pub(super) struct AttentionProduct<A> {
+    operands: Operands,
+    arithmetic: PhantomData<A>,
+}
 
 /// What makes the products of queries or probabilities that are `A`'s factors.
 pub(super) trait Multiply<S: Simd, A> {
     /// Blocks of keys begin at multiples of so many, and operands are in whole steps of so many elements.
     const KEYS: usize;
 
-    fn multiply(&mut self, simd: S, product: &AttentionProduct);
+    fn multiply(&mut self, simd: S, product: &AttentionProduct<A>);
 }
 
 /// Vectors. Their products are a piece of code of their own for each arithmetic: their tiles are many, and
@@ -47,9 +51,8 @@ impl<S: Simd, T: Stored> Multiply<S, Float32Products<T>> for VectorProducts {
     const KEYS: usize = S::LANES;
 
     #[inline(always)]
-    fn multiply(&mut self, simd: S, product: &AttentionProduct) {
-        let stored = PhantomData::<T>;
-        simd.run(InFloat32 { product, stored });
+    fn multiply(&mut self, simd: S, product: &AttentionProduct<Float32Products<T>>) {
+        simd.run(&mut InVectors(product));
     }
 }
 
@@ -57,8 +60,8 @@ impl<S: Simd> Multiply<S, Bf16Products> for VectorProducts {
     const KEYS: usize = S::LANES;
 
     #[inline(always)]
-    fn multiply(&mut self, simd: S, product: &AttentionProduct) {
-        simd.run(InBf16(product));
+    fn multiply(&mut self, simd: S, product: &AttentionProduct<Bf16Products>) {
+        simd.run(&mut InVectors(product));
     }
 }
 
@@ -67,8 +70,9 @@ impl<S: Simd, U: TileUnit> Multiply<S, Bf16Products> for Session<U> {
     const KEYS: usize = TILE * Operation::Bf16.per_word();
 
     #[inline(always)]
-    fn multiply(&mut self, _: S, AttentionProduct(product): &AttentionProduct) {
+    fn multiply(&mut self, _: S, product: &AttentionProduct<Bf16Products>) {
         const { assert!(S::LANES == TILE) }
+        let product = &product.operands;
         let mut first = 0;
         while first < product.vectors {
             let columns = columns_at_once(product, product.vectors - first);
@@ -107,36 +111,30 @@ fn columns_at_once(product: &Operands, left: usize) -> usize {
     }
 }
 
-/// The product in float32, with `b` stored as `T`.
-struct InFloat32<'a, T> {
-    product: &'a AttentionProduct,
-    stored: PhantomData<T>,
-}
+/// A product in registers.
+struct InVectors<'a, A>(&'a AttentionProduct<A>);
 
-impl<T: Stored> Kernel for InFloat32<'_, T> {
+impl<T: Stored> Kernel for InVectors<'_, Float32Products<T>> {
     type Output = ();
 
     #[inline(always)]
-    fn run<S: Simd>(self, simd: S) {
-        self.product.run::<S, Float32Products<T>>(simd);
+    fn run<S: Simd>(&mut self, simd: S) {
+        self.0.run(simd);
     }
 }
 
-/// The product in pairs of bfloat16.
-struct InBf16<'a>(&'a AttentionProduct);
-
-impl Kernel for InBf16<'_> {
+impl Kernel for InVectors<'_, Bf16Products> {
     type Output = ();
 
     #[inline(always)]
-    fn run<S: Simd>(self, simd: S) {
-        self.0.run::<S, Bf16Products>(simd);
+    fn run<S: Simd>(&mut self, simd: S) {
+        self.0.run(simd);
     }
 }
 
-impl AttentionProduct {
+impl<A> AttentionProduct<A> {
     /// # Safety
-    /// For as long as the product is used, with the arithmetic and the multiplier that it is used with:
+    /// For as long as the product is used, with the multiplier that it is used with:
     /// - `factors` points to `rows` rows, `factors_stride` apart, of the factors of `depth` elements;
     /// - `b` points to `vectors` vectors of words, `b_vector` apart, for each step over `depth` elements,
     ///   `b_step` apart;
@@ -145,38 +143,45 @@ impl AttentionProduct {
     /// - `out` points to `rows` rows, `out_stride` apart, of `vectors` vectors, which nothing else reads or
     ///   writes; they are initialised if `add` is set.
     pub(super) unsafe fn new(operands: Operands) -> Self {
-        Self(operands)
+        let arithmetic = PhantomData;
+        Self { operands, arithmetic }
     }
 
     /// All of it, for at most `TILE_ROWS` rows.
     #[inline(always)]
-    fn run<S: Simd, A: TileArithmetic<S>>(&self, simd: S) {
-        match self.0.rows {
-            1 => self.all::<S, A, 1>(simd),
-            2 => self.all::<S, A, 2>(simd),
-            3 => self.all::<S, A, 3>(simd),
-            4 => self.all::<S, A, 4>(simd),
-            5 if S::TILE_ROWS >= 5 => self.all::<S, A, 5>(simd),
-            6 if S::TILE_ROWS >= 6 => self.all::<S, A, 6>(simd),
-            7 if S::TILE_ROWS >= 7 => self.all::<S, A, 7>(simd),
-            8 if S::TILE_ROWS >= 8 => self.all::<S, A, 8>(simd),
+    fn run<S: Simd>(&self, simd: S)
+    where
+        A: TileArithmetic<S>,
+    {
+        match self.operands.rows {
+            1 => self.all::<S, 1>(simd),
+            2 => self.all::<S, 2>(simd),
+            3 => self.all::<S, 3>(simd),
+            4 => self.all::<S, 4>(simd),
+            5 if S::TILE_ROWS >= 5 => self.all::<S, 5>(simd),
+            6 if S::TILE_ROWS >= 6 => self.all::<S, 6>(simd),
+            7 if S::TILE_ROWS >= 7 => self.all::<S, 7>(simd),
+            8 if S::TILE_ROWS >= 8 => self.all::<S, 8>(simd),
             rows => unreachable!("a tile of {rows} rows"),
         }
     }
 
     /// All columns of `MR` rows, a few at a time.
     #[inline(always)]
-    fn all<S: Simd, A: TileArithmetic<S>, const MR: usize>(&self, simd: S) {
-        let vectors = self.0.vectors;
+    fn all<S: Simd, const MR: usize>(&self, simd: S)
+    where
+        A: TileArithmetic<S>,
+    {
+        let vectors = self.operands.vectors;
         let groups = vectors.div_ceil(S::TILE_VECTORS);
         for group in 0..groups {
             let first = vectors * group / groups;
             let end = vectors * (group + 1) / groups;
             match end - first {
-                1 => self.tile::<S, A, MR, 1>(simd, first),
-                2 if S::TILE_VECTORS >= 2 => self.tile::<S, A, MR, 2>(simd, first),
-                3 if S::TILE_VECTORS >= 3 => self.tile::<S, A, MR, 3>(simd, first),
-                4 if S::TILE_VECTORS >= 4 => self.tile::<S, A, MR, 4>(simd, first),
+                1 => self.tile::<S, MR, 1>(simd, first),
+                2 if S::TILE_VECTORS >= 2 => self.tile::<S, MR, 2>(simd, first),
+                3 if S::TILE_VECTORS >= 3 => self.tile::<S, MR, 3>(simd, first),
+                4 if S::TILE_VECTORS >= 4 => self.tile::<S, MR, 4>(simd, first),
                 vectors => unreachable!("a tile of {vectors} vectors"),
             }
         }
@@ -184,16 +189,20 @@ impl AttentionProduct {
 
     /// The micro-kernel: `MR` rows by `NV` vectors from `first` on.
     #[inline(always)]
-    fn tile<S: Simd, A: TileArithmetic<S>, const MR: usize, const NV: usize>(&self, simd: S, first: usize) {
-        let product = &self.0;
+    fn tile<S: Simd, const MR: usize, const NV: usize>(&self, simd: S, first: usize)
+    where
+        A: TileArithmetic<S>,
+    {
+        let product = &self.operands;
         // SAFETY: `new` was promised that the rows, the vectors and the steps over `depth` exist.
         unsafe {
-            let out = product.out.add(first * S::LANES);
+            let out = product.out.add(first * S::LANES).cast::<u32>();
             let mut sums = [[simd.splat(0.0); NV]; MR];
             if product.add {
                 for (r, row) in sums.iter_mut().enumerate() {
                     for (v, sum) in row.iter_mut().enumerate() {
-                        *sum = simd.load_ptr(out.add(r * product.out_stride + v * S::LANES));
+                        let at = out.add(r * product.out_stride + v * S::LANES);
+                        *sum = simd.bits_to_f32(simd.load_words_ptr(at));
                     }
                 }
             }
@@ -206,10 +215,10 @@ impl AttentionProduct {
                     for (r, row) in rows.iter_mut().enumerate().skip(1) {
                         *row = A::operand(simd, simd.load_words_ptr(factors.add(r * product.factors_stride)));
                     }
-                    self.lane::<S, A, MR, NV, 0>(simd, &mut sums, &rows, b);
-                    self.lane::<S, A, MR, NV, 1>(simd, &mut sums, &rows, b);
-                    self.lane::<S, A, MR, NV, 2>(simd, &mut sums, &rows, b);
-                    self.lane::<S, A, MR, NV, 3>(simd, &mut sums, &rows, b);
+                    self.lane::<S, MR, NV, 0>(simd, &mut sums, &rows, b);
+                    self.lane::<S, MR, NV, 1>(simd, &mut sums, &rows, b);
+                    self.lane::<S, MR, NV, 2>(simd, &mut sums, &rows, b);
+                    self.lane::<S, MR, NV, 3>(simd, &mut sums, &rows, b);
                     b = b.wrapping_add(4 / A::FACTORS * product.b_step);
                     factors = factors.wrapping_add(4);
                 }
@@ -233,7 +242,7 @@ impl AttentionProduct {
             }
             for (r, row) in sums.iter().enumerate() {
                 for (v, sum) in row.iter().enumerate() {
-                    simd.store_ptr(*sum, out.add(r * product.out_stride + v * S::LANES));
+                    simd.store_words_ptr(cast(*sum), out.add(r * product.out_stride + v * S::LANES));
                 }
             }
         }
@@ -244,17 +253,21 @@ impl AttentionProduct {
     /// # Safety
     /// `b` points to the steps of these four factors.
     #[inline(always)]
-    unsafe fn lane<S: Simd, A: TileArithmetic<S>, const MR: usize, const NV: usize, const LANE: i32>(
+    unsafe fn lane<S: Simd, const MR: usize, const NV: usize, const LANE: i32>(
         &self,
         simd: S,
         sums: &mut [[S::F32; NV]; MR],
         rows: &[A::Operand; MR],
         b: *const u32,
-    ) {
+    ) where
+        A: TileArithmetic<S>,
+    {
         let (step, part) = (LANE as usize / A::FACTORS, LANE as usize % A::FACTORS);
         for v in 0..NV {
             // SAFETY: the step exists, and `new` was promised that the vectors do.
-            let words = unsafe { simd.load_words_ptr(b.add(step * self.0.b_step + v * self.0.b_vector)) };
+            let words = unsafe {
+                simd.load_words_ptr(b.add(step * self.operands.b_step + v * self.operands.b_vector))
+            };
             let column = A::column(simd, words, part);
             for (row, &factors) in sums.iter_mut().zip(rows) {
                 row[v] = A::multiply_add_lane::<LANE>(simd, factors, column, row[v]);
@@ -265,8 +278,11 @@ impl AttentionProduct {
     /// Adds the product where values are not all finite: keys that the mask removes are passed over, because
     /// zero times infinity is not zero.
     #[inline(always)]
-    pub(super) fn add_without_removed<S: Simd, A: TileArithmetic<S>>(&self, simd: S, removed: &Removed<'_>) {
-        let product = &self.0;
+    pub(super) fn add_without_removed<S: Simd>(&self, simd: S, removed: &Removed<'_>)
+    where
+        A: TileArithmetic<S>,
+    {
+        let product = &self.operands;
         let words = product.depth.div_ceil(A::STEP) * A::FACTORS;
         for r in 0..product.rows {
             let query = removed.first_query + r;
@@ -286,8 +302,9 @@ impl AttentionProduct {
                     unsafe {
                         let words = product.b.add(k / A::STEP * product.b_step + v * product.b_vector);
                         let value = A::widen(simd, simd.load_words_ptr(words), k % A::STEP);
-                        let at = product.out.add(r * product.out_stride + v * S::LANES);
-                        simd.store_ptr(simd.fma(factor, value, simd.load_ptr(at)), at);
+                        let at = product.out.add(r * product.out_stride + v * S::LANES).cast();
+                        let sum = simd.bits_to_f32(simd.load_words_ptr(at));
+                        simd.store_words_ptr(cast(simd.fma(factor, value, sum)), at);
                     }
                 }
             }

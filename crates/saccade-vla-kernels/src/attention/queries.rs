@@ -11,6 +11,7 @@ use super::product::{AttentionProduct, Multiply, Operands, Removed, VectorProduc
 use super::softmax::{Row, Running};
 use crate::rows::{Rows, RowsMut};
 use crate::simd::bits::write_uninit;
+use crate::simd::slices::update;
 use crate::simd::{Kernel, LINE, MAX_TILE_ROWS, Simd};
 use crate::tiles::{MAX_ROWS, Session, TileKernel, TileUnit};
 
@@ -45,30 +46,30 @@ pub(super) struct QueryBlock<'a> {
 }
 
 /// Attention over float32 keys and values.
-pub(super) struct AttendF32<'a>(pub QueryBlock<'a>);
+pub(super) struct AttendF32<'a, 'b>(pub &'b mut QueryBlock<'a>);
 
 /// Attention over bfloat16 keys and values.
-pub(super) struct AttendBf16<'a>(pub QueryBlock<'a>);
+pub(super) struct AttendBf16<'a, 'b>(pub &'b mut QueryBlock<'a>);
 
 /// Attention over bfloat16 keys and values, by a unit that multiplies tiles.
-pub(super) struct AttendInTiles<'a>(pub QueryBlock<'a>);
+pub(super) struct AttendInTiles<'a, 'b>(pub &'b mut QueryBlock<'a>);
 
-impl Kernel for AttendF32<'_> {
+impl Kernel for AttendF32<'_, '_> {
     type Output = ();
 
     #[inline(always)]
-    fn run<S: Simd>(mut self, simd: S) {
+    fn run<S: Simd>(&mut self, simd: S) {
         self.0
             .run::<S, Float32Products<StoredF32>, _, MAX_TILE_ROWS>(simd, &mut VectorProducts);
     }
 }
 
-impl Kernel for AttendBf16<'_> {
+impl Kernel for AttendBf16<'_, '_> {
     type Output = ();
     const USES_DOT_BF16: bool = true;
 
     #[inline(always)]
-    fn run<S: Simd>(mut self, simd: S) {
+    fn run<S: Simd>(&mut self, simd: S) {
         if S::HAS_DOT_BF16 {
             self.0
                 .run::<S, Bf16Products, _, MAX_TILE_ROWS>(simd, &mut VectorProducts);
@@ -79,25 +80,26 @@ impl Kernel for AttendBf16<'_> {
     }
 }
 
-impl TileKernel for AttendInTiles<'_> {
+impl TileKernel for AttendInTiles<'_, '_> {
     type Output = ();
 
-    fn run<U: TileUnit>(self, unit: U) {
-        unit.simd().run(BesideUnit { block: self.0, unit });
+    fn run<U: TileUnit>(&mut self, unit: U) {
+        let block = &mut *self.0;
+        unit.simd().run(&mut BesideUnit { block, unit });
     }
 }
 
 /// The same on the vectors beside the unit.
-struct BesideUnit<'a, U> {
-    block: QueryBlock<'a>,
+struct BesideUnit<'a, 'b, U> {
+    block: &'b mut QueryBlock<'a>,
     unit: U,
 }
 
-impl<U: TileUnit> Kernel for BesideUnit<'_, U> {
+impl<U: TileUnit> Kernel for BesideUnit<'_, '_, U> {
     type Output = ();
 
     #[inline(always)]
-    fn run<S: Simd>(mut self, simd: S) {
+    fn run<S: Simd>(&mut self, simd: S) {
         // SAFETY: no other session is open on this thread: products end theirs before they return.
         let mut session = unsafe { Session::new(self.unit) };
         self.block.run::<S, Bf16Products, _, MAX_ROWS>(simd, &mut session);
@@ -190,8 +192,10 @@ impl QueryBlock<'_> {
                 count.next_multiple_of(S::LANES),
                 count.next_multiple_of(2 * S::LANES),
             );
-            for row in &mut scores.0[..rows] {
-                row[vectors..pairs].fill(MaybeUninit::new(0.0));
+            if vectors < pairs {
+                for row in &mut scores.0[..rows] {
+                    row[vectors..pairs].fill(MaybeUninit::new(0.0));
+                }
             }
             // SAFETY: the product has written whole vectors, and the loop above the rest of whole pairs.
             let mut probabilities = unsafe { scores.rows(rows, pairs, KEY_BLOCK) };
@@ -266,7 +270,7 @@ impl QueryBlock<'_> {
                     first_key: first,
                     len,
                 };
-                product.add_without_removed::<S, A>(simd, &removed);
+                product.add_without_removed(simd, &removed);
             }
         }
         // SAFETY: the product with the values of the last block has written the sums; without a block they
@@ -330,8 +334,9 @@ impl QueryBlock<'_> {
             let factors = factors.chunks_exact_mut(2 * S::LANES * A::FACTORS / A::STEP);
             for (query, factors) in query[columns.clone()].chunks(2 * S::LANES).zip(factors) {
                 let (first, second) = query.split_at(S::LANES.min(query.len()));
-                let scaled = [first, second].map(|query| simd.mul(simd.load_partial(query), scale));
-                write_uninit(A::factors(simd, scaled[0], scaled[1]), factors);
+                let (first, second) = (simd.load_partial(first), simd.load_partial(second));
+                let scaled = A::factors(simd, simd.mul(first, scale), simd.mul(second, scale));
+                write_uninit(scaled, factors);
             }
         }
     }
@@ -351,16 +356,12 @@ impl QueryBlock<'_> {
         // Nothing was added where no key is left: zeros divided by one.
         let divisor = simd.splat(if running.sum == 0.0 { 1.0 } else { running.sum });
         let out = &mut self.out.row_mut(r)[columns.first..][..columns.count];
-        for (out, sums) in out.chunks_mut(S::LANES).zip(sums.chunks_exact(S::LANES)) {
-            simd.store_partial(simd.div(simd.load(sums), divisor), out);
-        }
+        update(simd, out, [sums], |_, [sum]| simd.div(sum, divisor));
         if columns.first == 0
             && let Some(weights) = &mut self.weights
         {
             let (weights, removed) = weights.row_mut(r).split_at_mut(visible);
-            for weights in weights.chunks_mut(S::LANES) {
-                simd.store_partial(simd.div(simd.load_partial(weights), divisor), weights);
-            }
+            update(simd, weights, [], |weight, []| simd.div(weight, divisor));
             removed.fill(0.0);
         }
     }

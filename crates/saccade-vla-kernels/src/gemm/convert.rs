@@ -8,6 +8,7 @@ use super::elements::{Elements, RowElements};
 use super::outliers::Outliers;
 use super::{Conversion, Quantized};
 use crate::simd::bits::cast_slice_mut;
+use crate::simd::slices::update;
 use crate::simd::{Kernel, Simd};
 
 /// Less than unsigned bytes and zero points by this are [`RowElements::SignedBytes`].
@@ -30,13 +31,13 @@ impl<E: Elements> Kernel for Convert<'_, E> {
     type Output = ();
 
     #[inline(always)]
-    fn run<S: Simd>(self, simd: S) {
+    fn run<S: Simd>(&mut self, simd: S) {
         let Conversion {
             x,
-            mut words,
-            mut quantized,
-            mut outliers,
-        } = self.conversion;
+            words,
+            quantized,
+            outliers,
+        } = &mut self.conversion;
         for (group, words) in words.iter_mut().enumerate() {
             for row in group * E::GROUP..x.num_rows().min((group + 1) * E::GROUP) {
                 let place = |element_bytes| Place {
@@ -53,7 +54,7 @@ impl<E: Elements> Kernel for Convert<'_, E> {
                         let bytes = cast_slice_mut(words);
                         let outliers = outliers.as_mut().map(|outliers| &mut outliers.row_mut(row)[0]);
                         let how = quantize(simd, x.row(row), signed, place(1), bytes, outliers);
-                        if let Some(quantized) = &mut quantized {
+                        if let Some(quantized) = quantized {
                             quantized.row_mut(row)[0] = how;
                         }
                     }
@@ -87,9 +88,7 @@ impl Place {
 #[inline(always)]
 fn round<S: Simd>(simd: S, x: &[f32], words: &mut [u32]) {
     let to: &mut [f32] = cast_slice_mut(words);
-    for (x, to) in x.chunks(S::LANES).zip(to.chunks_mut(S::LANES)) {
-        simd.store_partial(simd.round_to_bf16(simd.load_partial(x)), to);
-    }
+    update(simd, &mut to[..x.len()], [x], |_, [x]| simd.round_to_bf16(x));
 }
 
 /// Rounds a row to bfloat16. In pairs of rows by the instruction that multiplies them.

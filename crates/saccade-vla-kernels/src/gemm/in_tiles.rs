@@ -114,7 +114,7 @@ unsafe impl<U: TileUnit, E: Elements> Gemm for InTiles<U, E> {
                 row[width..width.next_multiple_of(2 * TILE)].fill(0);
             }
         }
-        self.unit.simd().run(Convert::<E>::new(conversion));
+        self.unit.simd().run(&mut Convert::<E>::new(conversion));
     }
 
     fn multiply(&self, block: &Block<'_>, sums: &mut [MaybeUninit<u32>]) {
@@ -171,8 +171,8 @@ unsafe impl<U: TileUnit, E: Elements> Gemm for InTiles<U, E> {
         }
     }
 
-    fn multiply_outliers(&self, outliers: MultiplyOutliers<'_>) {
-        self.unit.simd().run(outliers);
+    fn multiply_outliers(&self, mut outliers: MultiplyOutliers<'_>) {
+        self.unit.simd().run(&mut outliers);
     }
 }
 

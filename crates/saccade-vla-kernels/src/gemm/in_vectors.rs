@@ -57,19 +57,19 @@ unsafe impl<S: Simd, E: RunsOn<S, L>, L: MicroKernel> Gemm for InVectors<S, E, L
     }
 
     fn convert(&self, conversion: Conversion<'_>) {
-        self.simd.run(Convert::<E>::new(conversion));
+        self.simd.run(&mut Convert::<E>::new(conversion));
     }
 
     fn multiply(&self, block: &Block<'_>, sums: &mut [MaybeUninit<u32>]) {
         let row_words = E::converted_stride(block.in_features).unwrap_or(block.in_features);
         block.check(self.shape(), self.panel_words(block.in_features), row_words, sums);
         // SAFETY: checked above, and `S` has the instructions because of `RunsOn`.
-        self.simd.run(unsafe { Multiply::<E, L>::new(block, sums) });
+        self.simd.run(&mut unsafe { Multiply::<E, L>::new(block, sums) });
     }
 
     fn multiply_outliers(&self, outliers: MultiplyOutliers<'_>) {
         let run = E::GROUP;
-        self.simd.run(MultiplyOutliers { run, ..outliers });
+        self.simd.run(&mut MultiplyOutliers { run, ..outliers });
     }
 }
 
@@ -93,7 +93,7 @@ impl<E: Step<L>, L: MicroKernel> Kernel for Multiply<'_, '_, E, L> {
     type Output = ();
 
     #[inline(always)]
-    fn run<S: Simd>(self, simd: S) {
+    fn run<S: Simd>(&mut self, simd: S) {
         // SAFETY: the constructor's contract.
         unsafe { L::multiply::<S, E>(simd, self.block, self.sums) }
     }
@@ -103,7 +103,7 @@ impl<E: Step<L>, L: MicroKernel> Kernel for Multiply<'_, '_, E, L> {
 impl<S: Simd, E: RunsOn<S, L>, L: MicroKernel> super::PeakLoop for InVectors<S, E, L> {
     fn multiply_for_peak(&self) -> usize {
         // SAFETY: `S` has the instructions because of `RunsOn`.
-        self.simd.run(unsafe { Peak::<E, L>::new() })
+        self.simd.run(&mut unsafe { Peak::<E, L>::new() })
     }
 }
 
@@ -125,7 +125,7 @@ impl<E: Step<L>, L: MicroKernel> Kernel for Peak<E, L> {
     type Output = usize;
 
     #[inline(always)]
-    fn run<S: Simd>(self, simd: S) -> usize {
+    fn run<S: Simd>(&mut self, simd: S) -> usize {
         // SAFETY: the constructor's contract.
         unsafe { L::multiply_for_peak::<S, E>(simd) }
     }

@@ -106,7 +106,7 @@ impl Kernel for MultiplyOutliers<'_> {
     type Output = ();
 
     #[inline(always)]
-    fn run<S: Simd>(self, _: S) {
+    fn run<S: Simd>(&mut self, _: S) {
         let rows = self.outliers.iter().zip(self.sums.chunks_exact_mut(self.columns));
         for (outliers, sums) in rows.filter(|(outliers, _)| !outliers.is_empty()) {
             for (input, value) in outliers.iter() {

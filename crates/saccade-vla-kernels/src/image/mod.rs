@@ -142,6 +142,32 @@ fn area(height: usize, width: usize) -> Result<usize, AllocError> {
 /// Elements of a row that are summed together: as many as fit into registers, and all of a block of the pass along the width.
 const TOGETHER: usize = CHANNELS * BLOCK;
 
+/// `out` as the sum of rows of `inner` elements times their weights: the products of the first `rounded` rows
+/// are rounded, those of the others fused.
+#[inline(always)]
+fn sum_rows(rows: &[f32], weights: &[f32], rounded: usize, inner: usize, out: &mut [f32]) {
+    let rows = &rows[..weights.len() * inner];
+    for start in (0..inner).step_by(TOGETHER) {
+        let len = TOGETHER.min(inner - start);
+        let mut sums = [0.0; TOGETHER];
+        for tap in 0..weights.len() {
+            let weight = weights[tap];
+            let row = padded(&rows[tap * inner + start..][..len]);
+            if tap < rounded {
+                // Zero plus the first product is that product.
+                for index in 0..TOGETHER {
+                    sums[index] += row[index] * weight;
+                }
+            } else {
+                for index in 0..TOGETHER {
+                    sums[index] = f32::mul_add(row[index], weight, sums[index]);
+                }
+            }
+        }
+        out[start..start + len].copy_from_slice(&sums[..len]);
+    }
+}
+
 /// The elements of a row that are summed together, with zeros after the last one.
 #[inline(always)]
 fn padded(row: &[f32]) -> [f32; TOGETHER] {
@@ -184,7 +210,7 @@ impl<S: Sums> Kernel for AlongWidth<'_, S> {
     type Output = ();
 
     #[inline(always)]
-    fn run<I: Simd>(self, _: I) {
+    fn run<I: Simd>(&mut self, _: I) {
         let Self {
             sums,
             image,
@@ -226,7 +252,7 @@ fn along_width<S: Sums>(isa: Isa, sums: &S, image: Image<'_>) -> Result<Vec<S::V
     let mut turned = blank(area(image.width, BLOCK)?)?;
     let mut summed = blank(area(sums.num_outputs(), BLOCK)?)?;
     let mut out = blank(area(image.height, sums.num_outputs())?)?;
-    isa.run(AlongWidth {
+    isa.run(&mut AlongWidth {
         sums,
         image,
         turned: &mut turned,
@@ -248,7 +274,7 @@ impl<S: Sums> Kernel for AlongHeight<'_, S> {
     type Output = ();
 
     #[inline(always)]
-    fn run<I: Simd>(self, _: I) {
+    fn run<I: Simd>(&mut self, _: I) {
         let (sums, inner) = (self.sums, self.inner);
         for index in 0..sums.num_outputs() {
             sums.sum(
@@ -269,7 +295,7 @@ fn along_height<S: Sums>(
     width: usize,
 ) -> Result<Vec<S::Value>, AllocError> {
     let mut out = blank(area(sums.num_outputs(), width)?)?;
-    isa.run(AlongHeight {
+    isa.run(&mut AlongHeight {
         sums,
         inputs,
         inner: width * CHANNELS,

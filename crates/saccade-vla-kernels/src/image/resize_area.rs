@@ -3,7 +3,7 @@
 //! Equation 45 of docs/equations.md.
 
 use super::taps::Taps;
-use super::{CHANNELS, Image, Sums, TOGETHER, along_height, along_width, area, blank, padded, reserved};
+use super::{CHANNELS, Image, Sums, along_height, along_width, area, blank, reserved, sum_rows};
 use crate::aligned::AllocError;
 use crate::isa::Isa;
 
@@ -124,19 +124,7 @@ impl Sums for Area {
     #[inline(always)]
     fn sum(&self, index: usize, inputs: &[f32], inner: usize, out: &mut [f32]) {
         let (first, weights) = self.0.of(index);
-        let inputs = &inputs[first * inner..(first + weights.len()) * inner];
-        for start in (0..inner).step_by(TOGETHER) {
-            let len = TOGETHER.min(inner - start);
-            let mut sums = [0.0; TOGETHER];
-            for tap in 0..weights.len() {
-                let weight = weights[tap];
-                let row = padded(&inputs[tap * inner + start..][..len]);
-                for index in 0..TOGETHER {
-                    sums[index] += row[index] * weight;
-                }
-            }
-            out[start..start + len].copy_from_slice(&sums[..len]);
-        }
+        sum_rows(&inputs[first * inner..], weights, weights.len(), inner, out);
     }
 }
 

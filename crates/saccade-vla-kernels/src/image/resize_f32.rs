@@ -3,7 +3,7 @@
 //! Equation 44 of docs/equations.md.
 
 use super::taps::Taps;
-use super::{Image, Sums, TOGETHER, along_height, along_width, blank, padded, reserved};
+use super::{Image, Sums, along_height, along_width, blank, reserved, sum_rows};
 use crate::aligned::AllocError;
 use crate::isa::Isa;
 
@@ -118,27 +118,8 @@ impl Sums for Linear {
     #[inline(always)]
     fn sum(&self, index: usize, inputs: &[f32], inner: usize, out: &mut [f32]) {
         let (first, weights) = self.0.of(index);
-        let inputs = &inputs[first * inner..(first + weights.len()) * inner];
         // The first tap, and as many fours of the others as there are.
         let rounded = 1 + (weights.len() - 1) / 4 * 4;
-        for start in (0..inner).step_by(TOGETHER) {
-            let len = TOGETHER.min(inner - start);
-            let mut sums = [0.0; TOGETHER];
-            for tap in 0..weights.len() {
-                let weight = weights[tap];
-                let row = padded(&inputs[tap * inner + start..][..len]);
-                if tap < rounded {
-                    // Zero plus the first product is that product.
-                    for index in 0..TOGETHER {
-                        sums[index] += row[index] * weight;
-                    }
-                } else {
-                    for index in 0..TOGETHER {
-                        sums[index] = f32::mul_add(row[index], weight, sums[index]);
-                    }
-                }
-            }
-            out[start..start + len].copy_from_slice(&sums[..len]);
-        }
+        sum_rows(&inputs[first * inner..], weights, rounded, inner, out);
     }
 }

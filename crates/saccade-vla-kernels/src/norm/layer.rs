@@ -5,6 +5,7 @@
 use crate::isa::Isa;
 use crate::parts::parallel_rows;
 use crate::rows::{Rows, RowsMut};
+use crate::simd::slices::update;
 use crate::simd::{Kernel, Simd};
 
 /// `out = norm(x) * scale + shift`, row by row, with `norm(x) = (x - mean) / sqrt(variance + eps)` over the
@@ -50,9 +51,9 @@ pub fn layer_norm(
     if rows == 0 || width == 0 {
         return;
     }
-    parallel_rows(threads, out, &|rows, out| {
+    parallel_rows(threads, out, |rows, out| {
         let x = x.rows(rows);
-        isa.run(LayerNorm {
+        isa.run(&mut LayerNorm {
             x,
             eps,
             scale_shift,
@@ -72,24 +73,14 @@ impl Kernel for LayerNorm<'_> {
     type Output = ();
 
     #[inline(always)]
-    fn run<S: Simd>(mut self, simd: S) {
+    fn run<S: Simd>(&mut self, simd: S) {
         for (out, x) in self.out.iter_mut().zip(self.x.iter()) {
             let norm = Norm::of(simd, x, self.eps);
-            let vectors = out.chunks_mut(S::LANES).zip(x.chunks(S::LANES));
             match self.scale_shift {
-                Some((scale, shift)) => {
-                    let scale_shift = scale.chunks(S::LANES).zip(shift.chunks(S::LANES));
-                    for ((out, x), (scale, shift)) in vectors.zip(scale_shift) {
-                        let normed = norm.apply(simd, simd.load_partial(x));
-                        let (scale, shift) = (simd.load_partial(scale), simd.load_partial(shift));
-                        simd.store_partial(simd.fma(normed, scale, shift), out);
-                    }
-                }
-                None => {
-                    for (out, x) in vectors {
-                        simd.store_partial(norm.apply(simd, simd.load_partial(x)), out);
-                    }
-                }
+                Some((scale, shift)) => update(simd, out, [x, scale, shift], |_, [x, scale, shift]| {
+                    simd.fma(norm.apply(simd, x), scale, shift)
+                }),
+                None => update(simd, out, [x], |_, [x]| norm.apply(simd, x)),
             }
         }
     }
@@ -136,26 +127,26 @@ fn sums<S: Simd>(simd: S, x: &[f32], centre: f32) -> (f32, f32) {
     let centres = simd.splat(centre);
     let mut sums = [simd.splat(0.0); CHAINS];
     let mut squares = [simd.splat(0.0); CHAINS];
-    let mut groups = x.chunks_exact(CHAINS * S::LANES);
-    for group in &mut groups {
+    let vectors = x.len() / S::LANES;
+    let grouped = vectors - vectors % CHAINS;
+    for first in (0..grouped).step_by(CHAINS) {
         // A loop over chains, so that their sums stay in registers.
         for chain in 0..CHAINS {
-            let distance = simd.sub(simd.load(&group[chain * S::LANES..]), centres);
+            let distance = simd.sub(simd.load(&x[(first + chain) * S::LANES..]), centres);
             sums[chain] = simd.add(sums[chain], distance);
             squares[chain] = simd.fma(distance, distance, squares[chain]);
         }
     }
     let mut sum = simd.add(simd.add(sums[0], sums[1]), simd.add(sums[2], sums[3]));
     let mut square = simd.add(simd.add(squares[0], squares[1]), simd.add(squares[2], squares[3]));
-    let mut vectors = groups.remainder().chunks_exact(S::LANES);
-    for x in &mut vectors {
-        let distance = simd.sub(simd.load(x), centres);
+    for vector in grouped..vectors {
+        let distance = simd.sub(simd.load(&x[vector * S::LANES..]), centres);
         sum = simd.add(sum, distance);
         square = simd.fma(distance, distance, square);
     }
     let (mut sum, mut square) = (simd.reduce_add(sum), simd.reduce_add(square));
     // One by one: lanes beyond the row would count as zeros, whose distance from the centre is not zero.
-    for x in vectors.remainder() {
+    for x in &x[vectors * S::LANES..] {
         let distance = x - centre;
         sum += distance;
         square += distance * distance;

@@ -5,6 +5,7 @@
 use crate::isa::Isa;
 use crate::parts::parallel_rows;
 use crate::rows::{Rows, RowsMut};
+use crate::simd::slices::update;
 use crate::simd::{Kernel, Simd};
 
 /// `out = x / sqrt(mean(x^2) + eps) * weight`, the mean over `weight.len()` consecutive columns.
@@ -54,9 +55,9 @@ fn norm(isa: Isa, threads: usize, x: Option<Rows<'_>>, eps: f32, weight: &[f32],
         "weight: expected {width} elements, or a divisor of that, got {}",
         weight.len()
     );
-    parallel_rows(threads, out, &|rows, out| {
+    parallel_rows(threads, out, |rows, out| {
         let x = x.map(|x| x.rows(rows));
-        isa.run(RmsNorm { x, eps, weight, out });
+        isa.run(&mut RmsNorm { x, eps, weight, out });
     });
 }
 
@@ -73,7 +74,7 @@ impl Kernel for RmsNorm<'_> {
     type Output = ();
 
     #[inline(always)]
-    fn run<S: Simd>(mut self, simd: S) {
+    fn run<S: Simd>(&mut self, simd: S) {
         let (weight, eps) = (self.weight, self.eps);
         for (row, out) in self.out.iter_mut().enumerate() {
             let heads = out.chunks_exact_mut(weight.len());
@@ -81,20 +82,17 @@ impl Kernel for RmsNorm<'_> {
                 Some(x) => {
                     for (out, x) in heads.zip(x.row(row).chunks_exact(weight.len())) {
                         let factor = factor(simd, x, eps);
-                        let vectors = out.chunks_mut(S::LANES).zip(x.chunks(S::LANES));
-                        for ((out, x), weight) in vectors.zip(weight.chunks(S::LANES)) {
-                            let y = simd.mul(simd.load_partial(x), factor);
-                            simd.store_partial(simd.mul(y, simd.load_partial(weight)), out);
-                        }
+                        update(simd, out, [x, weight], |_, [x, weight]| {
+                            simd.mul(simd.mul(x, factor), weight)
+                        });
                     }
                 }
                 None => {
                     for x in heads {
                         let factor = factor(simd, x, eps);
-                        for (x, weight) in x.chunks_mut(S::LANES).zip(weight.chunks(S::LANES)) {
-                            let y = simd.mul(simd.load_partial(x), factor);
-                            simd.store_partial(simd.mul(y, simd.load_partial(weight)), x);
-                        }
+                        update(simd, x, [weight], |x, [weight]| {
+                            simd.mul(simd.mul(x, factor), weight)
+                        });
                     }
                 }
             }

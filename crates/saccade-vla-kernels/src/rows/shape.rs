@@ -2,7 +2,7 @@
 
 use std::ops::Range;
 
-/// How many rows and columns, and elements from one row to the next.
+/// How many rows and columns, and elements from one row to the next: 0 where rows have no elements.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct RowShape {
     pub num_rows: usize,
@@ -43,9 +43,7 @@ impl RowShape {
         Self {
             num_rows,
             num_columns,
-            // Rows without elements are all at the beginning, wherever that is: no pointer to one is outside
-            // the data.
-            row_stride: if num_columns == 0 { 0 } else { row_stride },
+            row_stride: stride_of(num_columns, row_stride),
         }
     }
 
@@ -54,17 +52,13 @@ impl RowShape {
     #[inline]
     pub(super) fn row(&self, row: usize) -> Range<usize> {
         assert!(row < self.num_rows, "row {row} of {}", self.num_rows);
-        // The data may end before a row without elements.
-        let first = if self.num_columns == 0 {
-            0
-        } else {
-            row * self.row_stride
-        };
+        let first = row * self.row_stride;
         first..first + self.num_columns
     }
 
     /// The shape of some of the rows, and where they begin.
     #[track_caller]
+    #[inline]
     pub(super) fn rows(&self, rows: &Range<usize>) -> (Self, usize) {
         assert!(
             rows.start <= rows.end && rows.end <= self.num_rows,
@@ -80,6 +74,7 @@ impl RowShape {
 
     /// The shape of some of the columns, and where they begin.
     #[track_caller]
+    #[inline]
     pub(super) fn columns(&self, columns: &Range<usize>) -> (Self, usize) {
         assert!(
             columns.start <= columns.end && columns.end <= self.num_columns,
@@ -90,17 +85,24 @@ impl RowShape {
     }
 
     /// A part that begins at `start`, or wherever these rows do if it has no elements.
+    #[inline]
     fn part(&self, num_rows: usize, num_columns: usize, start: usize) -> (Self, usize) {
-        let row_stride = self.row_stride;
         let part = Self {
             num_rows,
             num_columns,
-            row_stride,
+            row_stride: stride_of(num_columns, self.row_stride),
         };
         (part, if part.is_empty() { 0 } else { start })
     }
 
+    #[inline]
     fn is_empty(&self) -> bool {
         self.num_rows == 0 || self.num_columns == 0
     }
+}
+
+/// Rows without elements are all at the beginning, wherever that is: no pointer to one is outside the data.
+#[inline]
+fn stride_of(num_columns: usize, row_stride: usize) -> usize {
+    if num_columns == 0 { 0 } else { row_stride }
 }

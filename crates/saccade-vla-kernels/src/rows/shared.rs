@@ -33,9 +33,29 @@ impl<'a, T> SharedRows<'a, T> {
     /// # Panics
     /// If not all of them exist.
     #[track_caller]
+    #[inline]
     pub(crate) unsafe fn block(&self, rows: Range<usize>, columns: Range<usize>) -> RowsMut<'_, T> {
         RowsMut::of(self.0.first, self.0.shape)
             .rows(rows)
             .columns(columns)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn blocks_of_shared_rows_are_apart() {
+        let mut data = (0..24_u32).collect::<Vec<_>>();
+        let shared = SharedRows::new(RowsMut::strided(&mut data, 4, 5, 6));
+        // SAFETY: the two have no element in common.
+        let (mut left, mut right) = unsafe { (shared.block(1..3, 0..2), shared.block(0..4, 2..5)) };
+        left.fill(100);
+        right.row_mut(3).fill(200);
+        assert_eq!(left.as_rows().row(1), [100, 100]);
+        assert_eq!(right.as_rows().row(1), [8, 9, 10]);
+        assert_eq!(data[18..], [18, 19, 200, 200, 200, 23]);
+        assert_eq!(data[6..14], [100, 100, 8, 9, 10, 11, 100, 100]);
     }
 }

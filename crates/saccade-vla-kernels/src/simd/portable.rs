@@ -50,8 +50,9 @@ impl<const N: usize> Simd for Loops<N> {
         Some(Self)
     }
 
-    #[inline]
-    fn run<K: Kernel>(self, kernel: K) -> K::Output {
+    // Not inlined: other instruction sets would pay for the stack that its kernels need.
+    #[inline(never)]
+    fn run<K: Kernel>(self, kernel: &mut K) -> K::Output {
         kernel.run(self)
     }
 

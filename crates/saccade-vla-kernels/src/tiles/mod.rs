@@ -11,6 +11,7 @@ mod software;
 #[cfg(test)]
 mod tests;
 
+use std::marker::PhantomData;
 use std::mem::size_of;
 
 use crate::simd::Simd;
@@ -219,7 +220,7 @@ pub(crate) unsafe trait TileUnit: Copy + Send + Sync + 'static {
 pub(crate) trait TileKernel {
     type Output;
 
-    fn run<U: TileUnit>(self, unit: U) -> Self::Output;
+    fn run<U: TileUnit>(&mut self, unit: U) -> Self::Output;
 }
 
 /// Tiles in use, until this is dropped.
@@ -228,6 +229,8 @@ pub(crate) struct Session<U: TileUnit> {
     registers: U::Registers,
     /// Rows of the tiles; 0 before they have sizes.
     rows: usize,
+    /// Of the thread that began it: tiles are a part of its state.
+    of_thread: PhantomData<*const ()>,
 }
 
 impl<U: TileUnit> Session<U> {
@@ -238,6 +241,7 @@ impl<U: TileUnit> Session<U> {
             unit,
             registers: unit.registers(),
             rows: 0,
+            of_thread: PhantomData,
         }
     }
 

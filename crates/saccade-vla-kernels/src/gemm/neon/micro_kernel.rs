@@ -178,8 +178,8 @@ fn widen<S: Simd>(simd: S, panel: &[u32], to: &mut [MaybeUninit<u32>]) -> *const
             let words = simd.load_words(words);
             // SAFETY: both have room for a vector.
             unsafe {
-                simd.store_ptr(simd.low_halves(words), low.as_mut_ptr().cast());
-                simd.store_ptr(simd.high_halves(words), high.as_mut_ptr().cast());
+                simd.store_words_ptr(cast(simd.low_halves(words)), low.as_mut_ptr().cast());
+                simd.store_words_ptr(cast(simd.high_halves(words)), high.as_mut_ptr().cast());
             }
         }
     }

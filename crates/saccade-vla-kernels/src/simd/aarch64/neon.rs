@@ -1,6 +1,12 @@
 //! NEON: vectors of 128 bits, and the dot products that go with them.
 
 use std::arch::aarch64::*;
+// Operations that are one instruction.
+use std::arch::aarch64::{
+    vaddq_f32 as add, vaddq_s32 as add_i32, vaddvq_f32 as reduce_add, vcvtq_f32_s32 as to_f32,
+    vdivq_f32 as div, vdupq_n_f32 as splat, vdupq_n_s32 as splat_i32, vmaxvq_f32 as reduce_max,
+    vmulq_f32 as mul, vmulq_s32 as mul_i32, vrndnq_f32 as round, vsubq_f32 as sub, vsubq_s32 as sub_i32,
+};
 use std::arch::is_aarch64_feature_detected;
 
 use super::instructions::{bfcvtn, bfdot, bfdot_lane, prefetch};
@@ -103,26 +109,6 @@ functions! {
 functions! {
     "neon":
 
-    fn splat(x: f32) -> float32x4_t {
-        vdupq_n_f32(x)
-    }
-
-    fn add(a: float32x4_t, b: float32x4_t) -> float32x4_t {
-        vaddq_f32(a, b)
-    }
-
-    fn sub(a: float32x4_t, b: float32x4_t) -> float32x4_t {
-        vsubq_f32(a, b)
-    }
-
-    fn mul(a: float32x4_t, b: float32x4_t) -> float32x4_t {
-        vmulq_f32(a, b)
-    }
-
-    fn div(a: float32x4_t, b: float32x4_t) -> float32x4_t {
-        vdivq_f32(a, b)
-    }
-
     fn fma(a: float32x4_t, b: float32x4_t, addend: float32x4_t) -> float32x4_t {
         vfmaq_f32(addend, a, b)
     }
@@ -138,10 +124,6 @@ functions! {
 
     fn max(a: float32x4_t, b: float32x4_t) -> float32x4_t {
         vbslq_f32(vcgtq_f32(a, b), a, b)
-    }
-
-    fn round(x: float32x4_t) -> float32x4_t {
-        vrndnq_f32(x)
     }
 
     fn scale_by_power_of_two(x: float32x4_t, exponent: float32x4_t) -> float32x4_t {
@@ -161,35 +143,6 @@ functions! {
 
     fn replace_where(x: float32x4_t, probe: float32x4_t, value: float32x4_t) -> float32x4_t {
         vbslq_f32(vceqq_f32(probe, value), value, x)
-    }
-
-    fn reduce_add(x: float32x4_t) -> f32 {
-        // Two pairs, then their sums.
-        vaddvq_f32(x)
-    }
-
-    fn reduce_max(x: float32x4_t) -> f32 {
-        vmaxvq_f32(x)
-    }
-
-    fn splat_i32(x: i32) -> int32x4_t {
-        vdupq_n_s32(x)
-    }
-
-    fn add_i32(a: int32x4_t, b: int32x4_t) -> int32x4_t {
-        vaddq_s32(a, b)
-    }
-
-    fn sub_i32(a: int32x4_t, b: int32x4_t) -> int32x4_t {
-        vsubq_s32(a, b)
-    }
-
-    fn mul_i32(a: int32x4_t, b: int32x4_t) -> int32x4_t {
-        vmulq_s32(a, b)
-    }
-
-    fn to_f32(x: int32x4_t) -> float32x4_t {
-        vcvtq_f32_s32(x)
     }
 
     fn low_halves(pairs: int32x4_t) -> float32x4_t {

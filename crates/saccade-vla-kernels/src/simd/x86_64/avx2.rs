@@ -1,6 +1,13 @@
 //! AVX2 with FMA: vectors of 256 bits, and the int8 dot products that go with them.
 
 use std::arch::x86_64::*;
+// Operations that are one instruction.
+use std::arch::x86_64::{
+    _mm256_add_epi32 as add_i32, _mm256_add_ps as add, _mm256_cvtepi32_ps as to_f32, _mm256_div_ps as div,
+    _mm256_fmadd_ps as fma, _mm256_max_ps as max, _mm256_min_ps as min, _mm256_mul_ps as mul,
+    _mm256_mullo_epi32 as mul_i32, _mm256_set1_epi32 as splat_i32, _mm256_set1_ps as splat,
+    _mm256_sub_epi32 as sub_i32, _mm256_sub_ps as sub,
+};
 
 use super::{NEAREST, prefetch};
 use crate::simd::bits::{read, write};
@@ -57,38 +64,6 @@ avx2! {
 functions! {
     "avx2,fma":
 
-    fn splat(x: f32) -> __m256 {
-        _mm256_set1_ps(x)
-    }
-
-    fn add(a: __m256, b: __m256) -> __m256 {
-        _mm256_add_ps(a, b)
-    }
-
-    fn sub(a: __m256, b: __m256) -> __m256 {
-        _mm256_sub_ps(a, b)
-    }
-
-    fn mul(a: __m256, b: __m256) -> __m256 {
-        _mm256_mul_ps(a, b)
-    }
-
-    fn div(a: __m256, b: __m256) -> __m256 {
-        _mm256_div_ps(a, b)
-    }
-
-    fn fma(a: __m256, b: __m256, addend: __m256) -> __m256 {
-        _mm256_fmadd_ps(a, b, addend)
-    }
-
-    fn min(a: __m256, b: __m256) -> __m256 {
-        _mm256_min_ps(a, b)
-    }
-
-    fn max(a: __m256, b: __m256) -> __m256 {
-        _mm256_max_ps(a, b)
-    }
-
     fn round(x: __m256) -> __m256 {
         _mm256_round_ps::<NEAREST>(x)
     }
@@ -110,26 +85,6 @@ functions! {
 
     fn replace_where(x: __m256, probe: __m256, value: __m256) -> __m256 {
         _mm256_blendv_ps(x, value, _mm256_cmp_ps::<_CMP_EQ_OQ>(probe, value))
-    }
-
-    fn splat_i32(x: i32) -> __m256i {
-        _mm256_set1_epi32(x)
-    }
-
-    fn add_i32(a: __m256i, b: __m256i) -> __m256i {
-        _mm256_add_epi32(a, b)
-    }
-
-    fn sub_i32(a: __m256i, b: __m256i) -> __m256i {
-        _mm256_sub_epi32(a, b)
-    }
-
-    fn mul_i32(a: __m256i, b: __m256i) -> __m256i {
-        _mm256_mullo_epi32(a, b)
-    }
-
-    fn to_f32(x: __m256i) -> __m256 {
-        _mm256_cvtepi32_ps(x)
     }
 
     fn low_halves(pairs: __m256i) -> __m256 {

@@ -2,20 +2,26 @@
 //! them.
 
 use std::arch::x86_64::*;
+// Operations that are one instruction.
+use std::arch::x86_64::{
+    _mm512_add_epi32 as add_i32, _mm512_add_ps as add, _mm512_cvtepi32_ps as to_f32, _mm512_div_ps as div,
+    _mm512_fmadd_ps as fma, _mm512_max_ps as max, _mm512_min_ps as min, _mm512_mul_ps as mul,
+    _mm512_mullo_epi32 as mul_i32, _mm512_scalef_ps as scale_by_power_of_two, _mm512_set1_epi32 as splat_i32,
+    _mm512_set1_ps as splat, _mm512_sub_epi32 as sub_i32, _mm512_sub_ps as sub,
+};
 
 use super::{NEAREST, avx2, prefetch};
-use crate::cpu::Cpu;
 use crate::simd::bits::{cast, read, write};
 use crate::simd::{Kernel, MAX_LANES, Simd, forward, functions, token};
 
 /// A token of these vectors, with what it adds to AVX-512 F, VL, BW and DQ.
 macro_rules! avx512 {
-    ($(#[$doc:meta])* $name:ident: [$($feature:tt),*] $(if $condition:expr)?, { $($own:tt)* }) => {
+    ($(#[$doc:meta])* $name:ident: [$($feature:tt),*], { $($own:tt)* }) => {
         token! {
             $(#[$doc])*
             $name: is_x86_feature_detected[
                 "avx512f", "avx512vl", "avx512bw", "avx512dq", "avx2", "fma" $(, $feature)*
-            ] $(if $condition)?, {
+            ], {
                 const NAME: &'static str = "avx512";
                 const LANES: usize = 16;
                 const TILE_ROWS: usize = 8;
@@ -54,9 +60,8 @@ avx512! {
 }
 
 avx512! {
-    /// AVX-512 with BF16, where its products are faster than those of float32: on Intel's Sapphire Rapids
-    /// they have half the rate.
-    Avx512Bf16: ["avx512bf16"] if Cpu::current().has_fast_bf16_dot(), {
+    /// AVX-512 with BF16.
+    Avx512Bf16: ["avx512bf16"], {
         const MAX_BYTE: u8 = 129;
         const HAS_DOT_BF16: bool = true;
         const DOT_NAME: &'static str = "bf16";
@@ -96,44 +101,8 @@ functions! {
 functions! {
     "avx512f,avx512vl,avx512bw,avx512dq,avx2,fma":
 
-    fn splat(x: f32) -> __m512 {
-        _mm512_set1_ps(x)
-    }
-
-    fn add(a: __m512, b: __m512) -> __m512 {
-        _mm512_add_ps(a, b)
-    }
-
-    fn sub(a: __m512, b: __m512) -> __m512 {
-        _mm512_sub_ps(a, b)
-    }
-
-    fn mul(a: __m512, b: __m512) -> __m512 {
-        _mm512_mul_ps(a, b)
-    }
-
-    fn div(a: __m512, b: __m512) -> __m512 {
-        _mm512_div_ps(a, b)
-    }
-
-    fn fma(a: __m512, b: __m512, addend: __m512) -> __m512 {
-        _mm512_fmadd_ps(a, b, addend)
-    }
-
-    fn min(a: __m512, b: __m512) -> __m512 {
-        _mm512_min_ps(a, b)
-    }
-
-    fn max(a: __m512, b: __m512) -> __m512 {
-        _mm512_max_ps(a, b)
-    }
-
     fn round(x: __m512) -> __m512 {
         _mm512_roundscale_ps::<NEAREST>(x)
-    }
-
-    fn scale_by_power_of_two(x: __m512, exponent: __m512) -> __m512 {
-        _mm512_scalef_ps(x, exponent)
     }
 
     fn low_bits_as_exponent(x: __m512) -> __m512 {
@@ -152,26 +121,6 @@ functions! {
     fn reduce_max(x: __m512) -> f32 {
         let (low, high) = (_mm512_castps512_ps256(x), _mm512_extractf32x8_ps::<1>(x));
         avx2::reduce_max(_mm256_max_ps(low, high))
-    }
-
-    fn splat_i32(x: i32) -> __m512i {
-        _mm512_set1_epi32(x)
-    }
-
-    fn add_i32(a: __m512i, b: __m512i) -> __m512i {
-        _mm512_add_epi32(a, b)
-    }
-
-    fn sub_i32(a: __m512i, b: __m512i) -> __m512i {
-        _mm512_sub_epi32(a, b)
-    }
-
-    fn mul_i32(a: __m512i, b: __m512i) -> __m512i {
-        _mm512_mullo_epi32(a, b)
-    }
-
-    fn to_f32(x: __m512i) -> __m512 {
-        _mm512_cvtepi32_ps(x)
     }
 
     fn low_halves(pairs: __m512i) -> __m512 {

@@ -1,6 +1,6 @@
-//! Tests of the views.
+//! The views of rows and of matrices.
 
-use super::*;
+use saccade_vla_kernels::{Matrix, Rows, RowsMut};
 
 fn counted(len: usize) -> Vec<u32> {
     (0..).take(len).collect()
@@ -33,20 +33,6 @@ fn rows_are_visited_copied_and_filled_without_what_is_between_them() {
     assert_eq!(one.iter_mut().count(), 1);
     let mut empty = RowsMut::strided(&mut data, 3, 0, 0);
     assert!(empty.iter_mut().len() == 3 && empty.iter_mut().all(|row| row.is_empty()));
-}
-
-#[test]
-fn blocks_of_shared_rows_are_apart() {
-    let mut data = counted(24);
-    let shared = SharedRows::new(RowsMut::strided(&mut data, 4, 5, 6));
-    // SAFETY: the two have no element in common.
-    let (mut left, mut right) = unsafe { (shared.block(1..3, 0..2), shared.block(0..4, 2..5)) };
-    left.fill(100);
-    right.row_mut(3).fill(200);
-    assert_eq!(left.as_rows().row(1), [100, 100]);
-    assert_eq!(right.as_rows().row(1), [8, 9, 10]);
-    assert_eq!(data[18..], [18, 19, 200, 200, 200, 23]);
-    assert_eq!(data[6..14], [100, 100, 8, 9, 10, 11, 100, 100]);
 }
 
 #[test]
@@ -102,4 +88,26 @@ fn rows_to_write_that_overlap_are_refused() {
 #[should_panic(expected = "rows 1..4 of 3")]
 fn rows_that_are_not_there_are_refused() {
     let _ = Rows::new(&[0.0; 6], 2).rows(1..4);
+}
+
+#[test]
+fn a_transposed_matrix_has_the_same_elements() {
+    let data: Vec<u32> = (0..12).collect();
+    let matrix = Matrix::new(&data, 4);
+    let turned = matrix.transpose();
+    assert_eq!((turned.num_rows(), turned.num_columns()), (4, 3));
+    for (row, column) in (0..3).flat_map(|row| (0..4).map(move |column| (row, column))) {
+        assert_eq!(matrix.get(row, column), turned.get(column, row));
+    }
+    assert_eq!(turned.rows(1..3).columns(2..3).get(1, 0), matrix.get(2, 2));
+    assert_eq!(matrix.contiguous_row(1), Some(&data[4..8]));
+    assert_eq!(turned.contiguous_row(1), None);
+}
+
+#[test]
+fn a_matrix_without_columns_has_rows() {
+    let none: [f32; 0] = [];
+    let matrix = Matrix::from(Rows::strided(&none, 3, 0, 0));
+    assert_eq!(matrix.transpose().num_columns(), 3);
+    assert_eq!(matrix.rows(2..3).contiguous_row(0), Some(&none[..]));
 }
