@@ -19,12 +19,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import importlib
-import importlib.resources
 import json
-import multiprocessing
-import os
-import shutil
 import signal
 import statistics
 import subprocess
@@ -32,18 +27,16 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 import saccade
+from benches.latency_contenders import Contenders, checkpoint, note, timed
 from benches.peers import inputs, machine
 from benches.peers.cases import Case
 from benches.peers.contenders import CONTENDERS
-from benches.peers.engines import Task
-from benches.warm import warm_up
 
 SECTIONS = ("loaded", "callers", "small", "overhead")
 LOADED = ("saccade-float32", "saccade-bfloat16", "saccade-int8", "lerobot-bfloat16")
@@ -59,88 +52,6 @@ NUM_CALLERS = 8
 SETTLE = 0.3  # seconds for the scheduler to distribute a new load
 
 Report = dict[str, Any]
-
-
-def worker(pipe: Connection, name: str, case: Case, source: Path, scratch: Path) -> None:
-    """A contender's process: builds its head, then answers `(work, count)` with `count` times in seconds."""
-    try:
-        arrays = inputs.inputs_of(case, saccade.HeadConfig.from_file(source / "config.json"))
-        arrays["expected"] = arrays["noise"]  # of the result's shape
-        if CONTENDERS[name].engine not in ("saccade_head", "lerobot"):
-            from saccade_lab.reference import ActionHead
-
-            arrays |= inputs.times_of(ActionHead.from_pretrained(source), case.steps)
-        engine = importlib.import_module(f"benches.peers.engines.{CONTENDERS[name].engine}")
-        works = dict(engine.build(Task(case, dict(CONTENDERS[name].options), source, arrays, scratch)).works)
-        encode, sample = works["encode"], works["sample"]
-        works["both"] = lambda: (encode(), sample())
-        for work in works.values():
-            work()
-        pipe.send("ready")
-        while (asked := pipe.recv()) is not None:
-            work, times = asked
-            warm_up(works[work])
-            pipe.send([timed(works[work]) for _ in range(times)])
-    except Exception as error:
-        pipe.send(RuntimeError(f"{name}: {type(error).__name__}: {error}"))
-
-
-def timed(work: Callable[[], Any]) -> float:
-    """Seconds of one call."""
-    start = time.perf_counter()
-    work()
-    return time.perf_counter() - start
-
-
-class Contenders:
-    """Processes that have built their heads; `ask` one of them for times."""
-
-    def __init__(self, names: list[str], case: Case, source: Path, scratch: Path) -> None:
-        self._pipes: dict[str, Connection] = {}
-        self._processes = []
-        spawn = multiprocessing.get_context("spawn")
-        for name in names:
-            note(f"building {name}, {case.threads} threads")
-            self._pipes[name], theirs = spawn.Pipe()
-            process = spawn.Process(target=worker, args=(theirs, name, case, source, scratch), daemon=True)
-            with environment({"OMP_NUM_THREADS": str(case.threads), "THP_MEM_ALLOC_ENABLE": "1"}):
-                process.start()
-            self._processes.append(process)
-            self._answer(name)
-
-    def _answer(self, name: str) -> Any:
-        answer = self._pipes[name].recv()
-        if isinstance(answer, Exception):
-            raise answer
-        return answer
-
-    def ask(self, name: str, work: str, times: int) -> list[float]:
-        """Seconds of each of `times` consecutive calls, after calls that warm up."""
-        self._pipes[name].send((work, times))
-        return list(self._answer(name))
-
-    def __enter__(self) -> Contenders:
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        for pipe in self._pipes.values():
-            with contextlib.suppress(OSError):
-                pipe.send(None)
-        for process in self._processes:
-            process.join(timeout=10)
-            process.kill()
-
-
-@contextlib.contextmanager
-def environment(added: dict[str, str]) -> Iterator[None]:
-    """The environment of processes started within; torch reads its settings when it is imported."""
-    before = os.environ.copy()
-    os.environ.update(added)
-    try:
-        yield
-    finally:
-        os.environ.clear()
-        os.environ.update(before)
 
 
 @contextlib.contextmanager
@@ -377,37 +288,6 @@ def policy_config() -> dict[str, Any]:
     file = saccade.demo_checkpoint() / "config.json"
     config: dict[str, Any] = json.loads(file.read_text())["action_head_cfg"]
     return config | {"max_num_embodiments": inputs.NUM_EMBODIMENTS}
-
-
-def checkpoint(config: dict[str, Any], folder: Path) -> Path:
-    """Random weights, written in a separate process so that this one stays small."""
-    if not folder.exists():
-        process = multiprocessing.get_context("spawn").Process(target=write, args=(config, folder))
-        process.start()
-        process.join()
-        if process.exitcode != 0:
-            raise SystemExit("latency: the weights could not be written")
-    return folder
-
-
-def write(config: dict[str, Any], folder: Path) -> None:
-    """Writes the checkpoint under a temporary name, then renames it."""
-    import torch
-
-    from saccade_lab.reference import random_weights
-
-    part = folder.with_name(folder.name + ".part")
-    shutil.rmtree(part, ignore_errors=True)
-    part.mkdir(parents=True)
-    random_weights.write_checkpoint(part, config, 0, through=torch.bfloat16)
-    part.rename(folder)
-    # While they are still written the rest is slower: on a Zen 5 671 instead of 1080 chunks/s of one caller.
-    os.sync()
-
-
-def note(message: str) -> None:
-    """Prints progress on stderr."""
-    print(f"latency: {message}", file=sys.stderr, flush=True)
 
 
 def parse() -> argparse.Namespace:
