@@ -24,7 +24,8 @@ impl HeadConfig {
     /// `model_type` says the version; without it the keys do.
     ///
     /// # Errors
-    /// [`Error::Checkpoint`] with everything that is missing, of the wrong type or contradictory.
+    /// [`Error::Checkpoint`](crate::Error::Checkpoint) with everything that is missing, of the wrong type or
+    /// contradictory.
     pub fn from_json(text: &str) -> Result<Self> {
         let config = CheckpointConfig::parse(text)?;
         let mut problems = Problems::default();
