@@ -128,6 +128,23 @@ def test_folders_with_something_in_them_are_left_alone(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
+        ({"cameras": {"../front": (8, 8)}}, "cameras: expected names of letters"),
+        ({"cameras": {"": (8, 8)}}, "cameras: expected names of letters"),
+        ({"cameras": {"front": (0, 8)}}, "cameras: front: expected at least 1, got 0"),
+        ({"state": {"arm": 0}}, "state: arm: expected at least 1, got 0"),
+        ({"action": {"a b": 1}}, "action: expected names of letters"),
+        ({"extra": {"timestamp": 1}}, "extra: expected names of letters"),
+        ({"fps": 29.97}, "fps: expected an integer, got 29.97"),
+    ],
+)
+def test_data_sets_of_another_form(tmp_path: Path, change: dict[str, Any], message: str) -> None:
+    with pytest.raises(saccade.InputError, match=message):
+        saccade.datasets.Writer(tmp_path / "data", **{**SIZES, **change})
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
         ({"task": None}, "task: expected an instruction"),
         ({"frames": {}}, "frames: expected front, wrist, got "),
         ({"extra": {}}, "extra: expected"),

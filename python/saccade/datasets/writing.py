@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 from collections.abc import Mapping
 from pathlib import Path
@@ -24,6 +25,7 @@ from saccade.robots.data_configs import LANGUAGE_KEY
 
 #: lerobot's: megabytes of a file until the next one begins, and files in a folder.
 DATA_MB, VIDEO_MB, CHUNK = 100, 200, 1000
+NAME = re.compile(r"[A-Za-z0-9_][\w-]*(\.[\w-]+)*", re.ASCII)
 FILE = "chunk-{chunk_index:03d}/file-{file_index:03d}"
 #: Columns that every data set of lerobot has.
 INDICES = ("frame_index", "episode_index", "index", "task_index")
@@ -77,9 +79,11 @@ class Writer:
         if self.path.exists() and (not self.path.is_dir() or any(self.path.iterdir())):
             raise InputError(f"path: expected a new or empty folder, got {self.path}, where something is")
         self._fps = integer("fps", fps)
+        for argument, given in {"cameras": cameras, "state": state, "action": action, "extra": extra}.items():
+            _check_names(argument, given or {})
         self._robot = robot
         self._cameras = {
-            name: (integer("cameras", height), integer("cameras", width))
+            name: (integer(f"cameras: {name}", height), integer(f"cameras: {name}", width))
             for name, (height, width) in cameras.items()
         }
         self._numbers = {"state": dict(state), "action": dict(action)}
@@ -313,6 +317,18 @@ PANDAS = {
     ],
     "pandas_version": "2.0.0",
 }
+
+
+def _check_names(argument: str, given: Mapping[Any, Any]) -> None:
+    """Names become keys, columns and folders; widths are positive."""
+    for name, width in given.items():
+        is_taken = argument == "extra" and name in (STATE, ACTION, "timestamp", *INDICES)
+        if not isinstance(name, str) or not NAME.fullmatch(name) or is_taken:
+            raise InputError(
+                f"{argument}: expected names of letters, digits, '_', '-' and '.' that are free, got {name!r}"
+            )
+        if argument != "cameras":
+            integer(f"{argument}: {name}", width)
 
 
 def _rows(name: str, values: npt.ArrayLike, dtype: type) -> npt.NDArray[Any]:
