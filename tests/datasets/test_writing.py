@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+import av
 import numpy as np
 import pytest
 
@@ -67,6 +68,17 @@ def test_what_is_written_comes_back(tmp_path: Path) -> None:
     write(tmp_path / "data")
     check(tmp_path / "data")
     assert [path.name for path in tmp_path.iterdir()] == ["data"]
+
+
+def test_every_episode_begins_with_a_keyframe(tmp_path: Path) -> None:
+    write(tmp_path)
+    data = saccade.datasets.open(tmp_path)
+    for part in zip(*(one.videos.values() for one in data.episodes), strict=True):
+        with av.open(str(tmp_path / part[0].file)) as container:
+            packets: list[Any] = [packet for packet in container.demux(video=0) if packet.pts is not None]
+        keyframes = {float(packet.pts * packet.time_base) for packet in packets if packet.is_keyframe}
+        assert {one.start for one in part} <= keyframes
+        assert [packet.pts for packet in packets] == [packet.dts for packet in packets]
 
 
 def test_files_that_are_full_are_followed_by_others(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

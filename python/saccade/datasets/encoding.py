@@ -10,7 +10,7 @@ from saccade._internal.arrays import UInt8Array
 from saccade._internal.extras import SACCADE
 
 #: Without loss, and with a keyframe every few frames, which makes any frame quick to reach.
-OPTIONS = {"qp": "0", "g": "10", "bf": "0"}
+OPTIONS = {"qp": "0", "g": "10", "bf": "0", "forced-idr": "1"}
 CODEC, PIXELS = "libx264rgb", "gbrp"
 
 
@@ -47,11 +47,17 @@ class VideoFile:
         return self.count / self.fps
 
     def append(self, frames: UInt8Array) -> None:
-        """Appends frames ``(count, height, width, 3)``."""
-        import av
+        """Appends frames ``(count, height, width, 3)``.
 
-        for pixels in frames:
+        The first is a keyframe, so that programs that copy a part of a video can cut there.
+        """
+        import av
+        from av.video.frame import PictureType
+
+        for place, pixels in enumerate(frames):
             frame: Any = av.VideoFrame.from_ndarray(pixels, "rgb24")
+            if not place:
+                frame.pict_type = PictureType.I
             frame.pts, frame.time_base = self.count, Fraction(1, self.fps)
             self._write(self._stream.encode(frame))
             self.count += 1
