@@ -2,7 +2,7 @@
 
     python studies/diagnosis/blind_trial.py make WORK [--checkpoints 12]
     python studies/diagnosis/blind_trial.py judge WORK RECORDINGS [--jobs 4]
-    python studies/diagnosis/blind_trial.py open WORK SEAL studies/diagnosis/blind-trial.json
+    python studies/diagnosis/blind_trial.py open WORK SEAL studies/diagnosis/blind-trial-2.json
 
 `make` copies the bundled policy and operates on each copy in a way that it draws: nothing, all text
 embeddings made equal, the patch embedding zeroed (no camera sees), or the last layer of the state encoder
@@ -118,8 +118,9 @@ def unseal(work: Path, seal: str, out: Path) -> None:
         one.update(label=labels[name], right=ignored == list(IGNORED[labels[name]]) and used)
         right += one["right"]
         print(name, labels[name], "right" if one["right"] else "WRONG", ignored)
-    print(f"{right} of {len(labels)} right")
-    write_json(out, {"seal": seal, "salt": salt, "right": right, "of": len(labels), **verdicts})
+    judged = len(verdicts["checkpoints"])
+    print(f"{right} of {judged} right")
+    write_json(out, {"seal": seal, "salt": salt, "right": right, "of": judged, **verdicts})
 
 
 def main() -> None:
