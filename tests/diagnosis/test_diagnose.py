@@ -35,7 +35,7 @@ def near(data: Recorded, episode: int, partner: int | None = 1) -> Neighbours:
     return Neighbours(
         first=parsed(data, episode, 0),
         partner=None if partner is None else parsed(data, partner, 0),
-        instructions=["open the drawer", "press the button"],
+        instructions={"reach the green ball": 9, "open the drawer": 8, "press the button": 7},
         spread=np.array([0.1, 0, 0, 0.2], np.float32),
         rng=np.random.default_rng(0),
     )
@@ -71,7 +71,7 @@ def test_every_change_changes_its_input_only(data: Recorded) -> None:
 
 def test_what_would_change_nothing_is_left_out(data: Recorded) -> None:
     first = parsed(data, 0, 0)
-    told = [str(text) for text in first.instructions]
+    told = {str(text): 9 for text in first.instructions}
     alone = dataclasses.replace(near(data, 0, None), instructions=told, spread=np.zeros(4, np.float32))
     left = [str(change) for change, after in changed(first, alone) if after is not None]
     assert left == [
@@ -103,10 +103,14 @@ def test_a_history_is_replaced_by_the_newest() -> None:
     assert "history: repeated" not in {str(change) for change, _ in changed(base, near(data, 0, None))}
 
 
-def test_the_replacement_has_other_words() -> None:
-    assert replacement("a b c", ["a b d", "x y z u", "x y z", "a b c"]) == "x y z"
-    assert replacement("a b", ["a b"]) is None
-    assert replacement("", ["", "a"]) == "a"
+def test_the_replacement_has_other_words_and_as_many_tokens() -> None:
+    told = {"a b c": 9, "a b d": 9, "x y z u": 10, "x y z": 12, "c x": 10}
+    # Half of the words of "a b d" are those of "a b c"; of the nearest others, one has fewer.
+    assert replacement("a b c", told) == "x y z u"
+    assert replacement("a b c", {"a b c": 9, "a d e": 9, "x": 30}) == "a d e"
+    assert replacement("a b c", {"a b c": 9, "a b c d": 9}) == "a b c d"  # there is no other
+    assert replacement("a b", {"a b": 3}) is None
+    assert replacement("", {"": 1, "a": 2}) == "a"
 
 
 @pytest.mark.parametrize("count", [2, 3, 20])

@@ -15,6 +15,8 @@ from saccade.observations import ParsedObservation
 Kind: TypeAlias = Literal["main", "natural", "removal"]
 Frames: TypeAlias = Mapping[str, UInt8Array]
 
+MOST_COMMON = 0.5  # an instruction that replaces another has less of its words
+
 #: A view of a camera with several frames in an observation.
 VIEW = re.compile(r"(?P<camera>.*)\[(?P<time>[0-9]+)\]", re.DOTALL)
 
@@ -44,14 +46,14 @@ class Neighbours:
     Attributes:
         first: The first observation of the episode.
         partner: An observation of another episode; None if there is no other.
-        instructions: All instructions of the episodes.
+        instructions: All instructions of the episodes, and the number of tokens of each.
         spread: Standard deviation of the state, ``(state_width,)``.
         rng: For the order of words.
     """
 
     first: ParsedObservation
     partner: ParsedObservation | None
-    instructions: Sequence[str]
+    instructions: Mapping[str, int]
     spread: Float32Array
     rng: np.random.Generator
 
@@ -73,23 +75,34 @@ def camera_of(view: str, views: Sequence[str]) -> str:
     return own["camera"] if own is not None and all(found) else view
 
 
-def replacement(text: str, instructions: Sequence[str]) -> str | None:
-    """The instruction with the fewest words in common, then with the nearest number of words.
+def replacement(text: str, instructions: Mapping[str, int]) -> str | None:
+    """The instruction that a diagnosis tells instead: other words, and if possible as many tokens.
+
+    Of the others with less than half of the words in common (without such, of all), the one with the nearest
+    number of tokens, then the fewest words in common. So the prompt keeps its length where it can.
+
+    Args:
+        text: The instruction.
+        instructions: All instructions, and the number of tokens of each.
 
     Example:
-        >>> replacement("open the door", ["open the window", "push a red button", "open the door"])
-        'push a red button'
+        >>> told = {"open the door": 9, "open the window": 9, "push a red button": 10, "reach it": 8}
+        >>> replacement("open the door", told), replacement("reach it", told)
+        ('push a red button', 'open the door')
     """
-    words = text.lower().split()
+    others = {other: _common(text, other) for other in instructions if other != text}
+    apart = [other for other, common in others.items() if common < MOST_COMMON] or list(others)
 
-    def distance(other: str) -> tuple[float, int]:
-        theirs = other.lower().split()
-        union = set(words) | set(theirs)
-        common = len(set(words) & set(theirs)) / max(1, len(union))
-        return common, abs(len(theirs) - len(words))
+    def order(other: str) -> tuple[int, float]:
+        return abs(instructions[other] - instructions[text]), others[other]
 
-    others = [other for other in dict.fromkeys(instructions) if other != text]
-    return min(others, key=distance) if others else None
+    return min(apart, key=order, default=None)
+
+
+def _common(one: str, other: str) -> float:
+    """The share of their words that two texts have in common."""
+    first, second = set(one.lower().split()), set(other.lower().split())
+    return len(first & second) / max(1, len(first | second))
 
 
 def _instructions(

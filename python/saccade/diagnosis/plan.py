@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from saccade.evaluation.recordings import Recordings, length_of, observation_at
+from saccade.observations import ParsedObservation
+from saccade.policy.preparing import prepare_inputs
 
 if TYPE_CHECKING:
     from saccade.policy.policy import Policy
@@ -24,14 +26,14 @@ class Plan:
     Attributes:
         episodes: Places of the episodes.
         partners: The other episode of each; empty if there is only one.
-        instructions: The instructions of the observations, each once.
+        instructions: The instructions of the observations, and the number of tokens of each prompt.
         spread: Standard deviation of each number of the state over the observations.
         seed: The seed.
     """
 
     episodes: tuple[int, ...]
     partners: Mapping[int, int]
-    instructions: tuple[str, ...]
+    instructions: Mapping[str, int]
     spread: tuple[float, ...]
     seed: int
 
@@ -65,12 +67,22 @@ def planned(policy: Policy, data: Recordings, episodes: Sequence[int], seed: int
     Raises:
         SaccadeError: One does not fit the policy; the message names episode and step.
     """
-    texts: dict[str, None] = {}
+    texts: dict[str, int] = {}
     states = []
     for episode in episodes:
         for step in steps_of(length_of(data, episode)):
             parsed = observation_at(policy, data, episode, step)
             states.append(parsed.state[0, -1])
-            texts.update(dict.fromkeys(text for text in parsed.instructions if text is not None))
+            (text,) = parsed.instructions
+            if text is not None and text not in texts:
+                texts[text] = _num_tokens(policy, parsed)
     spread = np.std(np.stack(states).astype(np.float64), axis=0)
-    return Plan(tuple(episodes), partners_of(episodes, seed), tuple(texts), tuple(spread.tolist()), seed)
+    return Plan(tuple(episodes), partners_of(episodes, seed), texts, tuple(spread.tolist()), seed)
+
+
+def _num_tokens(policy: Policy, observation: ParsedObservation) -> int:
+    """Number of tokens of the prompt of an observation; 0 if the policy has no processor."""
+    if policy.processor is None:
+        return 0
+    (inputs,) = prepare_inputs([observation], policy.processor)
+    return int(np.shape(inputs.input_ids)[1])

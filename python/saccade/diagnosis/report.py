@@ -41,7 +41,7 @@ class Diagnosis:
             "edges": {name: asdict(one) for name, one in self.edges.items()},
             "episodes": list(self.plan.episodes),
             "partners": {str(one): other for one, other in self.plan.partners.items()},
-            "instructions": list(self.plan.instructions),
+            "instructions": dict(self.plan.instructions),
             "spread": list(self.plan.spread),
             "seed": self.plan.seed,
             "seconds": self.seconds,
