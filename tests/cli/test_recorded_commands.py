@@ -174,6 +174,16 @@ def test_a_diagnosis_is_that_of_the_function(
     assert json.loads(capsys.readouterr().out) == found
 
 
+@pytest.mark.parametrize("text", ["", "[]", "{", "7"])
+def test_damaged_settings_of_a_run_are_named(
+    text: str, folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "episodes").mkdir()
+    (tmp_path / "episodes" / "settings.json").write_text(text)
+    assert run("evaluate", DEMO, folder, "--out", tmp_path, "--num-threads", 1) == 2
+    assert "settings.json: " in capsys.readouterr().err
+
+
 def test_processes_need_the_lab(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for option in (("--jobs", 2), ("--backend", "ray")):
         assert run("evaluate", DEMO, folder, "--out", tmp_path / "out", *option) == 2

@@ -1,8 +1,8 @@
 """Independent work items in several processes, of this machine or of a Ray cluster.
 
-``saccade rollout``, ``demos`` and ``study`` share it. ``workers`` says where items run, and ``run`` runs
-them; ``local`` and ``cluster`` are the two kinds of processes; ``files`` brings checkpoints to other
-machines.
+``saccade rollout``, ``demos`` and ``study`` share it, and ``evaluate`` and ``diagnose`` by
+:mod:`saccade_lab.recordings`. ``workers`` says where items run, and ``run`` runs them; ``local`` and
+``cluster`` are the two kinds of processes; ``files`` brings checkpoints to other machines.
 """
 
 from saccade_lab.parallel.run import each
