@@ -15,6 +15,22 @@ use crate::inspect::trace::Recorded;
 
 /// A second context of the same observations, such as one without their instructions, and a weight `w`: with
 /// the velocities `v` of the first and `u` of the second, sampling follows `u + w (v - u)`.
+///
+/// ```
+/// # use saccade_vla::{ActionHead, Array, ArrayMut, Features, Guidance, LoadOptions, Sampling};
+/// # let head = ActionHead::load("examples/tiny".as_ref(), &LoadOptions::default())?;
+/// # let (state, noise) = (Array::new(&[0.0; 8], &[1, 8])?, Array::new(&[0.5; 128], &[1, 16, 8])?);
+/// let context = head.encode(&Features::new(Array::new(&[0.1; 640], &[1, 20, 32])?))?;
+/// let without = head.encode(&Features::new(Array::new(&[0.2; 576], &[1, 18, 32])?))?;
+/// let sampling = Sampling {
+///     guidance: Some(Guidance { without: &without, weight: 2.0 }),
+///     ..Sampling::default()
+/// };
+/// let mut actions = [0.0; 128];
+/// let out = ArrayMut::new(&mut actions, &[1, 16, 8])?;
+/// head.sample(&context, state, Array::new(&[0], &[])?, noise, &sampling, out)?;
+/// # Ok::<(), saccade_vla::Error>(())
+/// ```
 #[derive(Clone, Copy)]
 pub struct Guidance<'a> {
     /// Encoded by the same head, with as many observations as the first context. The numbers of

@@ -155,6 +155,9 @@ impl Policy {
 
     /// Samples chunks of normalised actions, as [`ActionHead::sample`] does.
     ///
+    /// For [`Guidance`](crate::Guidance) away from the same observations without their instructions, encode these
+    /// with the first context as `previous`: the views and the common beginning of the prompt are taken from it.
+    ///
     /// # Errors
     /// As [`ActionHead::sample`].
     pub fn sample(
