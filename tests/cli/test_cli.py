@@ -220,7 +220,10 @@ def test_all_that_is_missing_is_named_with_one_command(name: str, tmp_path: Path
     arguments = {
         "act": ["checkpoint"],
         "attention --frames": ["frames"],
+        "certify": ["certificate.json"],
         "demos": ["--out", "out"],
+        "diagnose": ["checkpoint", "recordings", "--out", "out"],
+        "evaluate": ["checkpoint", "recordings", "--out", "out"],
         "inspect --precision-check": ["frames", "checkpoint"],
         "serve": ["checkpoint"],
         "train": ["--demos", str(tmp_path), "--out", "out"],
