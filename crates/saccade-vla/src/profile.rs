@@ -82,16 +82,6 @@ pub struct Profile {
 }
 
 impl Profile {
-    const NONE: Self = Self {
-        counters: [Counter {
-            calls: 0,
-            time: Duration::ZERO,
-            multiply_adds: 0,
-            bytes: 0,
-            kernel: None,
-        }; Part::ALL.len()],
-    };
-
     /// Counts what this thread does, until what this returns is finished or dropped.
     pub fn start() -> Profiling {
         GUARDS.set(GUARDS.get() + 1);
@@ -144,7 +134,7 @@ thread_local! {
     /// The number of guards of this thread.
     static GUARDS: Cell<usize> = const { Cell::new(0) };
     /// Everything counted while there was any.
-    static COUNTED: RefCell<Profile> = const { RefCell::new(Profile::NONE) };
+    static COUNTED: RefCell<Profile> = RefCell::default();
 }
 
 /// Runs `call`, whose work is `(multiply_adds, bytes)`, and counts it under `part` if this thread counts.

@@ -1,8 +1,7 @@
 //! The layers of a backbone, from the names of their tensors: the one place that lists them.
 
-use super::config::BackboneConfig;
 use super::qwen3::Qwen3;
-use super::recognise::{Recognised, TensorNames};
+use super::recognise::Recognised;
 use super::vision::Vision;
 use crate::error::Result;
 use crate::nn::embedding::Embedding;
@@ -20,24 +19,19 @@ pub(super) struct BackboneLayers {
     pub projection: Option<Linear>,
 }
 
-impl BackboneLayers {
-    /// The layers of a backbone of this config, whose tensors have these names.
-    ///
-    /// # Errors
-    /// Those of the source of the weights.
-    fn new(weights: &Weights<'_>, names: &TensorNames, config: &BackboneConfig) -> Result<Self> {
-        let language = &config.language;
-        // First, while little else is in memory: it is by far the largest tensor.
-        let embedding = Embedding::new(
-            &weights.at(&names.embedding),
-            [language.vocab_size, language.width],
-        )?;
-        let names = &names.parts;
-        Ok(Self {
-            embedding,
-            vision: Vision::new(weights, names, config)?,
+impl Recognised {
+    /// The layers of the backbone.
+    pub(super) fn layers(&self, weights: &Weights<'_>) -> Result<BackboneLayers> {
+        let (names, language) = (&self.names.parts, &self.config.language);
+        Ok(BackboneLayers {
+            // First, while little else is in memory: it is by far the largest tensor.
+            embedding: Embedding::new(
+                &weights.at(&self.names.embedding),
+                [language.vocab_size, language.width],
+            )?,
+            vision: Vision::new(weights, names, &self.config)?,
             language: Qwen3::new(&weights.at(names.language), language)?,
-            projection: match config.project_to_dim {
+            projection: match self.config.project_to_dim {
                 Some(width) => {
                     let layer = weights.at(names.projection);
                     Some(Linear::new(&layer, language.width, width, Role::Other)?.counted(Part::Output))
@@ -45,15 +39,5 @@ impl BackboneLayers {
                 None => None,
             },
         })
-    }
-}
-
-impl Recognised {
-    /// The layers of the backbone.
-    ///
-    /// # Errors
-    /// Those of the source of the weights.
-    pub(super) fn layers(&self, weights: &Weights<'_>) -> Result<BackboneLayers> {
-        BackboneLayers::new(weights, &self.names, &self.config)
     }
 }

@@ -103,18 +103,6 @@ struct BlockCall<'a> {
     first_row: usize,
 }
 
-impl BlockCall<'_> {
-    /// Sequences that run.
-    fn sequences(&self) -> usize {
-        self.pass.context.batch * self.pass.samples
-    }
-
-    /// The key of a recording.
-    fn step_block(&self) -> StepBlock {
-        (self.pass.step, self.index)
-    }
-}
-
 /// The input of a pass, of which the residual stream is changed in place. Kept between calls.
 #[derive(Default)]
 pub(crate) struct DitInput {
@@ -290,13 +278,20 @@ impl Dit {
         action: Rows<'_>,
         workspace: &'a mut DitWorkspace,
     ) -> Result<Rows<'a>> {
-        let DitWorkspace { y, output, .. } = workspace;
-        let mut y = y.rows(action.num_rows(), self.width)?;
-        let norm = AdaptiveNorm::new(OUTPUT_EPS, |time| &time.output);
-        norm.apply(kernels.engine, times, action, y.reborrow())?;
-        let out = output.rows(action.num_rows(), self.output.out_features())?;
+        let mut y = workspace.y.rows(action.num_rows(), self.width)?;
+        adaptive_norm(
+            kernels.engine,
+            OUTPUT_EPS,
+            times,
+            |time| &time.output,
+            action,
+            y.reborrow(),
+        )?;
+        let out = workspace
+            .output
+            .rows(action.num_rows(), self.output.out_features())?;
         self.output.apply(kernels, y.as_rows(), Epilogue::Store, out)?;
-        Ok(output.as_rows())
+        Ok(workspace.output.as_rows())
     }
 
     /// `x += attention(adaptive_norm(x))`. Keys and values come from the rows `all` where `x` is only some of
@@ -310,27 +305,25 @@ impl Dit {
         workspace: &mut DitWorkspace,
         x: RowsMut<'_>,
     ) -> Result<()> {
-        let BlockCall {
-            pass,
-            times,
-            index,
-            first_row,
-        } = call;
+        let (pass, index) = (call.pass, call.index);
         let block = &self.blocks[index];
-        let DitWorkspace {
-            y,
-            y_all,
-            attention,
-            held: held_by_block,
-            ..
-        } = workspace;
-        let norm = AdaptiveNorm::new(BLOCK_EPS, |time| &time.blocks[index]);
-        let normed = y.rows(x.num_rows(), self.width)?;
-        norm.apply(kernels.engine, times, x.as_rows(), normed)?;
-        let y = Sequences::new(y.as_rows(), call.sequences());
-        let bias = pass.compiled.bias(pass.step, index, first_row);
+        let sequences = pass.context.batch * pass.samples;
+        let norm = |h: Rows<'_>, y: &mut Scratch| {
+            let y = y.rows(h.num_rows(), self.width)?;
+            adaptive_norm(
+                kernels.engine,
+                BLOCK_EPS,
+                call.times,
+                |time| &time.blocks[index],
+                h,
+                y,
+            )
+        };
+        norm(x.as_rows(), &mut workspace.y)?;
+        let y = Sequences::new(workspace.y.as_rows(), sequences);
+        let bias = pass.compiled.bias(pass.step, index, call.first_row);
         let bias = bias.map_or(Bias::None, Bias::Shared);
-        let probabilities = recorded.attention(call.step_block());
+        let probabilities = recorded.attention((pass.step, index));
         if let Some(reads) = block.reads {
             let subset = pass.context.positions(reads).map(|positions| Subset {
                 positions,
@@ -342,33 +335,33 @@ impl Dit {
                 bias,
                 probabilities,
             };
-            return block
-                .attention
-                .cross(kernels, y, keys, attention, Epilogue::Add, x);
+            let memory = &mut workspace.attention;
+            return block.attention.cross(kernels, y, keys, memory, Epilogue::Add, x);
         }
         let source = match all {
             None => y,
             Some(all) => {
-                let normed = y_all.rows(all.num_rows(), self.width)?;
-                norm.apply(kernels.engine, times, all, normed)?;
-                Sequences::new(y_all.as_rows(), call.sequences())
+                norm(all, &mut workspace.y_all)?;
+                Sequences::new(workspace.y_all.as_rows(), sequences)
             }
         };
         let first_held = match pass.rows {
             ActiveRows::All | ActiveRows::Needed => None,
             ActiveRows::NeededAndHeld => Some(0),
-            ActiveRows::Actions => Some(first_row),
+            ActiveRows::Actions => Some(call.first_row),
         };
         let keys = SelfKeys {
             source,
             held: first_held.map(|first| Held {
-                caches: &mut held_by_block[index],
+                caches: &mut workspace.held[index],
                 first,
             }),
             bias,
             probabilities,
         };
-        block.attention.add_self(kernels, y, keys, attention, x)
+        block
+            .attention
+            .add_self(kernels, y, keys, &mut workspace.attention, x)
     }
 
     /// `x += ff(norm(x))`; then patches and records the rows.
@@ -380,20 +373,14 @@ impl Dit {
         workspace: &mut DitWorkspace,
         mut x: RowsMut<'_>,
     ) -> Result<()> {
-        let BlockCall {
-            pass,
-            index,
-            first_row,
-            ..
-        } = call;
-        let DitWorkspace { y, hidden, .. } = workspace;
-        let mut y = y.rows(x.num_rows(), self.width)?;
+        let (pass, index) = (call.pass, call.index);
+        let mut y = workspace.y.rows(x.num_rows(), self.width)?;
         layer_norm(kernels.engine, BLOCK_EPS, None, x.as_rows(), y.reborrow())?;
         let feed_forward = &self.blocks[index].feed_forward;
-        feed_forward.add(kernels, y.as_rows(), hidden, x.reborrow())?;
+        feed_forward.add(kernels, y.as_rows(), &mut workspace.hidden, x.reborrow())?;
         pass.compiled
-            .patch(pass.step, index, first_row, pass.samples, x.reborrow());
-        if let Some(recorded) = recorded.hidden(call.step_block()) {
+            .patch(pass.step, index, call.first_row, pass.samples, x.reborrow());
+        if let Some(recorded) = recorded.hidden((pass.step, index)) {
             RowsMut::new(recorded, self.width).copy_from(x.as_rows());
         }
         Ok(())
@@ -414,31 +401,21 @@ fn gather_action_rows(groups: &Groups, h: Rows<'_>, action: &mut Scratch) -> Res
     Ok(())
 }
 
-/// `norm(h) * (1 + scale) + shift` with each observation's own scale and shift.
-struct AdaptiveNorm<F> {
+/// `norm(h) * (1 + scale) + shift` with each observation's own scale and shift, which `of` selects among the
+/// modulations of its timestep.
+fn adaptive_norm(
+    engine: Engine,
     eps: f32,
-    /// Selects one of the modulations of a timestep.
-    of: F,
-}
-
-impl<F: Fn(&TimeModulations) -> &Modulation> AdaptiveNorm<F> {
-    fn new(eps: f32, of: F) -> Self {
-        Self { eps, of }
+    times: &[Arc<TimeModulations>],
+    of: impl Fn(&TimeModulations) -> &Modulation,
+    h: Rows<'_>,
+    mut y: RowsMut<'_>,
+) -> Result<()> {
+    // Usually all observations are at one timestep, and one call does all rows.
+    for (time, rows) in Sequences::new(h, times.len()).runs(times, Arc::ptr_eq) {
+        let Modulation { scale, shift } = of(time);
+        let y = y.reborrow().rows(rows.clone());
+        layer_norm(engine, eps, Some((scale, shift)), h.rows(rows), y)?;
     }
-
-    fn apply(
-        &self,
-        engine: Engine,
-        times: &[Arc<TimeModulations>],
-        h: Rows<'_>,
-        mut y: RowsMut<'_>,
-    ) -> Result<()> {
-        // Usually all observations are at one timestep, and one call does all rows.
-        for (time, rows) in Sequences::new(h, times.len()).runs(times, Arc::ptr_eq) {
-            let Modulation { scale, shift } = (self.of)(time);
-            let y = y.reborrow().rows(rows.clone());
-            layer_norm(engine, self.eps, Some((scale, shift)), h.rows(rows), y)?;
-        }
-        Ok(())
-    }
+    Ok(())
 }

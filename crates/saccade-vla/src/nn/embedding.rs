@@ -1,6 +1,5 @@
 //! Tables of which only a few rows are read in a call: never packed.
 
-use half::bf16;
 use saccade_vla_checkpoint::Elements;
 
 use super::source::Tensor;
@@ -9,23 +8,17 @@ use crate::error::Result;
 
 /// A row for each id, `weight (num_rows, width)`.
 pub(crate) struct Embedding {
-    rows: Table,
+    /// None of an outline.
+    rows: Elements,
     width: usize,
-}
-
-enum Table {
-    F32(Vec<f32>),
-    Bf16(Vec<bf16>),
-    Int8 { values: Vec<i8>, scales: Vec<f32> },
 }
 
 impl Embedding {
     /// From `weight (num_rows, width)`.
     pub(crate) fn new(weights: &Weights<'_>, [num_rows, width]: [usize; 2]) -> Result<Self> {
         let rows = match weights.looked_up([num_rows, width])? {
-            Tensor::Held(Elements::Bf16(rows)) => Table::Bf16(rows),
-            Tensor::Held(Elements::Int8 { values, scales }) => Table::Int8 { values, scales },
-            other => Table::F32(other.into_f32()?),
+            Tensor::Held(rows) => rows,
+            Tensor::Outline(_) => Elements::F32(Vec::new()),
         };
         Ok(Self { rows, width })
     }
@@ -34,13 +27,13 @@ impl Embedding {
     pub(crate) fn look_up(&self, id: usize, out: &mut [f32]) {
         let row = id * self.width..(id + 1) * self.width;
         match &self.rows {
-            Table::F32(rows) => out.copy_from_slice(&rows[row]),
-            Table::Bf16(rows) => {
+            Elements::F32(rows) => out.copy_from_slice(&rows[row]),
+            Elements::Bf16(rows) => {
                 for (out, element) in out.iter_mut().zip(&rows[row]) {
                     *out = element.to_f32();
                 }
             }
-            Table::Int8 { values, scales } => {
+            Elements::Int8 { values, scales } => {
                 for (out, value) in out.iter_mut().zip(&values[row]) {
                     *out = f32::from(*value) * scales[id];
                 }
