@@ -1,4 +1,5 @@
-//! Memory whose size a caller decides: asked for, never assumed.
+//! Memory whose size a caller decides: asked for, never assumed. What the system refuses is
+//! [`Error::Memory`]; what takes long can be interrupted.
 
 use saccade_vla_kernels::{AlignedVec, Rows, RowsMut};
 
@@ -7,9 +8,6 @@ use crate::error::{Error, Result};
 use crate::ops::{check_interrupted, refused};
 
 /// Makes room for `len` elements in all.
-///
-/// # Errors
-/// [`Error::Memory`] if the system refuses it.
 pub(crate) fn reserve<T>(what: &'static str, buffer: &mut Vec<T>, len: usize) -> Result<()> {
     let more = len.saturating_sub(buffer.len());
     buffer.try_reserve_exact(more).map_err(|_| Error::Memory {
@@ -19,9 +17,6 @@ pub(crate) fn reserve<T>(what: &'static str, buffer: &mut Vec<T>, len: usize) ->
 }
 
 /// An empty vector with room for `len` elements.
-///
-/// # Errors
-/// [`Error::Memory`] if the system refuses it.
 pub(crate) fn reserved<T>(what: &'static str, len: usize) -> Result<Vec<T>> {
     let mut buffer = Vec::new();
     reserve(what, &mut buffer, len)?;
@@ -29,9 +24,6 @@ pub(crate) fn reserved<T>(what: &'static str, len: usize) -> Result<Vec<T>> {
 }
 
 /// `len` times `value`.
-///
-/// # Errors
-/// [`Error::Memory`] if the system refuses it, [`Error::Interrupted`].
 pub(crate) fn filled<T: Clone>(what: &'static str, len: usize, value: T) -> Result<Vec<T>> {
     let mut buffer = reserved(what, len)?;
     in_stretches(0, len, |len| buffer.resize(len, value.clone()))?;
@@ -43,9 +35,6 @@ pub(crate) fn filled<T: Clone>(what: &'static str, len: usize, value: T) -> Resu
 const TOGETHER: usize = 1 << 24;
 
 /// Calls `resize` with greater and greater lengths from `held` on, the last of which is `len`.
-///
-/// # Errors
-/// [`Error::Interrupted`].
 fn in_stretches(mut held: usize, len: usize, mut resize: impl FnMut(usize)) -> Result<()> {
     while held + TOGETHER < len {
         check_interrupted()?;
@@ -57,9 +46,6 @@ fn in_stretches(mut held: usize, len: usize, mut resize: impl FnMut(usize)) -> R
 }
 
 /// The elements of `values`, of which there are `len`.
-///
-/// # Errors
-/// [`Error::Memory`] if the system refuses it.
 pub(crate) fn collected<T>(
     what: &'static str,
     len: usize,
@@ -71,9 +57,6 @@ pub(crate) fn collected<T>(
 }
 
 /// A copy of rows.
-///
-/// # Errors
-/// [`Error::Memory`] if the system refuses it.
 pub(crate) fn copied(what: &'static str, rows: Rows<'_>) -> Result<Vec<f32>> {
     let mut buffer = reserved(what, rows.num_rows() * rows.num_columns())?;
     rows.iter().for_each(|row| buffer.extend_from_slice(row));
@@ -91,9 +74,6 @@ pub(crate) struct Scratch {
 
 impl Scratch {
     /// Gives the rows this shape.
-    ///
-    /// # Errors
-    /// [`Error::Memory`] if the system refuses it, [`Error::Interrupted`].
     pub(crate) fn rows(&mut self, num_rows: usize, num_columns: usize) -> Result<RowsMut<'_>> {
         self.slice(product("activations", &[num_rows, num_columns])?)?;
         (self.num_rows, self.num_columns) = (num_rows, num_columns);
@@ -101,9 +81,6 @@ impl Scratch {
     }
 
     /// Gives it this many elements, as one row.
-    ///
-    /// # Errors
-    /// As [`Self::rows`].
     pub(crate) fn slice(&mut self, len: usize) -> Result<&mut [f32]> {
         (self.num_rows, self.num_columns) = (0, 0);
         self.memory.reserve(len).map_err(refused("activations"))?;

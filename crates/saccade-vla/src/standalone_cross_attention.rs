@@ -79,14 +79,13 @@ impl CrossAttention {
         num_threads: Option<usize>,
     ) -> Result<Self> {
         let engine = Engine::new(precision, num_threads)?;
-        let axes = |name: &str| memory::shape_of(tensors, name);
+        let size = |name: &str, axis: usize| {
+            let shape = memory::shape_of(tensors, name)?;
+            shape.get(axis).copied()
+        };
         // The sizes come from two of the tensors; the others must agree with them.
-        let width = axes("to_q.weight")
-            .and_then(|shape| shape.first().copied())
-            .unwrap_or(1);
-        let context_dim = axes("to_k.weight")
-            .and_then(|shape| shape.get(1).copied())
-            .unwrap_or(1);
+        let width = size("to_q.weight", 0).unwrap_or(1);
+        let context_dim = size("to_k.weight", 1).unwrap_or(1);
         let layer = |num_heads| {
             move |weights: &Weights<'_>| {
                 Attention::new(weights, width, context_dim, num_heads, Part::ContextToKv)

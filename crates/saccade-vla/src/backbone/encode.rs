@@ -106,7 +106,7 @@ impl Backbone {
             .iter()
             .map(|inputs| Checked::new(&self.config, inputs))
             .collect::<Result<_>>()?;
-        self.with_workspace(|workspace| {
+        self.workspaces.with(Default::default, |workspace| {
             let views = self.views(&checked, previous, keep.vision, workspace)?;
             let sequences = self.sequences(&checked, views, previous)?;
             let mut results = checked
@@ -161,12 +161,10 @@ impl Backbone {
             }
             found.push(of_inputs);
         }
-        let BackboneWorkspace { vision, linear, .. } = workspace;
-        let kernels = &mut Kernels::new(self.engine, linear);
+        let kernels = &mut Kernels::new(self.engine, &mut workspace.linear);
         let tower = &self.layers.vision;
-        let mut encoded = tower
-            .encode(kernels, &self.config, &new, record, vision)?
-            .into_iter();
+        let encoded = tower.encode(kernels, &self.config, &new, record, &mut workspace.vision)?;
+        let mut encoded = encoded.into_iter();
         let views = found.into_iter().map(|of_inputs| {
             let one = |view: Option<Arc<View>>| view.or_else(|| encoded.next());
             of_inputs.into_iter().filter_map(one).collect()
@@ -334,19 +332,16 @@ impl Backbone {
         caches: Vec<Vec<PackedKeyValues>>,
         workspace: &mut BackboneWorkspace,
     ) -> Result<Vec<Arc<EncodedPrompt>>> {
-        let BackboneWorkspace {
-            language,
-            projected,
-            linear,
-            ..
-        } = workspace;
+        let language = &mut workspace.language;
         let (model, x) = (&self.layers.language, language.x.as_rows());
         let mut features = model.finish(self.engine, x, &mut language.y)?;
         if let Some(layer) = &self.layers.projection {
-            let out = projected.rows(features.num_rows(), layer.out_features())?;
-            let kernels = &mut Kernels::new(self.engine, linear);
+            let out = workspace
+                .projected
+                .rows(features.num_rows(), layer.out_features())?;
+            let kernels = &mut Kernels::new(self.engine, &mut workspace.linear);
             layer.apply(kernels, features, Epilogue::Store, out)?;
-            features = projected.as_rows();
+            features = workspace.projected.as_rows();
         }
         let mut first = 0;
         let mut encoded = Vec::new();
@@ -368,13 +363,8 @@ fn encoded_prompt(
     new: Rows<'_>,
     keys_values: Vec<PackedKeyValues>,
 ) -> Result<EncodedPrompt> {
-    let Prompt {
-        ids,
-        attended,
-        image_tokens,
-        ..
-    } = sequence.prompt;
-    let dim = new.num_columns();
+    let prompt = sequence.prompt;
+    let (ids, dim) = (prompt.ids, new.num_columns());
     let mut features = reserved("backbone_features", ids.len() * dim)?;
     if let Some((held, len)) = sequence.known {
         features.extend_from_slice(&held.features[..len * dim]);
@@ -383,9 +373,13 @@ fn encoded_prompt(
     Array::new(&features, &[ids.len(), dim])?.check_result("backbone_features")?;
     Ok(EncodedPrompt {
         ids: collected("input_ids", ids.len(), ids.iter().copied())?,
-        attended: collected("attention_mask", ids.len(), attended.iter().copied())?,
+        attended: collected("attention_mask", ids.len(), prompt.attended.iter().copied())?,
         views: sequence.views.clone(),
-        image_tokens: collected("image_mask", image_tokens.len(), image_tokens.iter().copied())?,
+        image_tokens: collected(
+            "image_mask",
+            prompt.image_tokens.len(),
+            prompt.image_tokens.iter().copied(),
+        )?,
         features,
         keys_values,
     })

@@ -73,17 +73,15 @@ impl<'a> Checked<'a> {
     /// # Errors
     /// [`Error::Shape`] and [`Error::Input`] for what does not fit.
     pub(super) fn new(config: &BackboneConfig, inputs: &BackboneInputs<'a>) -> Result<Self> {
-        let &[batch, num_tokens] = inputs.input_ids.shape() else {
-            return Err(Error::Shape(problem!(
-                "input_ids"; expected "(batch, tokens)"; got "{}", show_shape(inputs.input_ids.shape())
-            )));
+        let (batch, num_tokens) = match *inputs.input_ids.shape() {
+            [batch, tokens] if batch > 0 && tokens > 0 => (batch, tokens),
+            ref other => {
+                return Err(Error::Shape(problem!(
+                    "input_ids"; expected "(batch, tokens) with at least one prompt and token";
+                    got "{}", show_shape(other)
+                )));
+            }
         };
-        if batch == 0 || num_tokens == 0 {
-            return Err(Error::Shape(problem!(
-                "input_ids"; expected "(batch, tokens) with at least one prompt and token";
-                got "{}", show_shape(inputs.input_ids.shape())
-            )));
-        }
         if let Some(mask) = inputs.attention_mask {
             mask.check_shape("attention_mask", "(batch, tokens)", &[batch, num_tokens])?;
         }

@@ -8,7 +8,6 @@ use super::qwen3::LanguageWorkspace;
 use super::vision::VisionWorkspace;
 use crate::alloc::Scratch;
 use crate::engine::Engine;
-use crate::error::Result;
 use crate::workspaces::Workspaces;
 
 /// A loaded vision-language backbone. Immutable; serves any number of threads at once.
@@ -49,13 +48,5 @@ impl Backbone {
     #[must_use]
     pub fn nbytes(&self) -> usize {
         self.nbytes
-    }
-
-    /// Runs `call` with a workspace.
-    pub(super) fn with_workspace<R>(
-        &self,
-        call: impl FnOnce(&mut BackboneWorkspace) -> Result<R>,
-    ) -> Result<R> {
-        self.workspaces.with(BackboneWorkspace::default, call)
     }
 }

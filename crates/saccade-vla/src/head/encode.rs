@@ -5,7 +5,6 @@ use saccade_vla_kernels::Rows;
 use super::action_head::ActionHead;
 use super::context::{Context, Seen};
 use super::vl_encoder::VlTokens;
-use super::workspace::Workspace;
 use crate::alloc::{collected, reserved};
 use crate::array::Array;
 use crate::config::Reads;
@@ -102,11 +101,8 @@ impl ActionHead {
             cross: &self.layers.dit.cross_attentions(),
         };
         let (vl_embs, keys_values) = self.with_workspace(|workspace| {
-            let Workspace {
-                vl: memory, linear, ..
-            } = workspace;
-            let kernels = &mut Kernels::new(self.engine, linear);
-            vl.encode(kernels, &tokens, &mut recorded, memory)
+            let kernels = &mut Kernels::new(self.engine, &mut workspace.linear);
+            vl.encode(kernels, &tokens, &mut recorded, &mut workspace.vl)
         })?;
         let shape = [batch, num_vl_tokens, self.config.context_dim];
         Array::new(&vl_embs, &shape)?.check_result("vl_embs")?;
@@ -125,19 +121,16 @@ impl ActionHead {
     fn check_features(&self, features: &Features<'_>) -> Result<(usize, usize)> {
         let array = features.backbone_features;
         let context_dim = self.config.context_dim;
-        let &[batch, num_vl_tokens, width] = array.shape() else {
-            return Err(Error::Shape(problem!(
-                "backbone_features"; expected "(batch, num_vl_tokens, {context_dim})";
-                got "{}", show_shape(array.shape())
-            )));
+        let (batch, num_vl_tokens) = match *array.shape() {
+            [batch, tokens, width] if width == context_dim && batch > 0 && tokens > 0 => (batch, tokens),
+            _ => {
+                return Err(Error::Shape(problem!(
+                    "backbone_features";
+                    expected "(batch, num_vl_tokens, {context_dim}) with at least one observation and token";
+                    got "{}", show_shape(array.shape())
+                )));
+            }
         };
-        if width != context_dim || batch == 0 || num_vl_tokens == 0 {
-            return Err(Error::Shape(problem!(
-                "backbone_features";
-                expected "(batch, num_vl_tokens, {context_dim}) with at least one observation and token";
-                got "{}", show_shape(array.shape())
-            )));
-        }
         array.check_finite("backbone_features")?;
         let masks = [
             ("attention_mask", features.attention_mask),

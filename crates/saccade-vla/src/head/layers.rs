@@ -24,9 +24,6 @@ pub(crate) struct HeadLayers {
 
 impl HeadLayers {
     /// The layers of a head of this config, for these of its embodiments.
-    ///
-    /// # Errors
-    /// As the source of the weights has them.
     pub(crate) fn new(
         weights: &Weights<'_>,
         config: &HeadConfig,

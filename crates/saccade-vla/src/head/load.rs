@@ -8,7 +8,7 @@ use saccade_vla_checkpoint::spec;
 use super::action_head::ActionHead;
 use super::embodiments::{Embodiments, chosen_embodiments};
 use super::layers::HeadLayers;
-use super::plan::{is_unused, reading_order, specs_of};
+use super::plan::{head_plan, is_unused, specs_of};
 use super::state_dropout::{STATE_DROPOUT, StateDropout, reads_state_dropout};
 use crate::config::HeadConfig;
 use crate::engine::{Engine, next_id};
@@ -97,7 +97,7 @@ impl ActionHead {
             config,
             ..
         } = published;
-        let wanted = reading_order(&config, &embodiment_ids)?;
+        let wanted = head_plan(&config, &embodiment_ids)?.wanted;
         FileSource::read_ahead(&checkpoint, prefix, wanted, |tensors| {
             Self::build(tensors, engine, config, embodiment_ids, drops_states)
         })

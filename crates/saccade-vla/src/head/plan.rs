@@ -1,6 +1,6 @@
 //! The tensors of a head without the head: what its checkpoint must hold, and in which order it is read.
 
-use saccade_vla_checkpoint::{TensorSpec, Wanted};
+use saccade_vla_checkpoint::TensorSpec;
 
 use super::embodiments::Embodiments;
 use super::layers::HeadLayers;
@@ -25,9 +25,6 @@ pub fn tensor_shapes(config: &HeadConfig) -> Result<Vec<(String, Vec<usize>)>> {
 
 /// The tensors that must fit a head of this config where `has` finds them: those that it needs, and what it
 /// reads if it is there.
-///
-/// # Errors
-/// As [`tensor_shapes`].
 pub(crate) fn specs_of(config: &HeadConfig, has: impl Fn(&str) -> bool) -> Result<Vec<TensorSpec>> {
     let mut specs = tensor_specs(config)?;
     if has(STATE_DROPOUT) {
@@ -37,23 +34,13 @@ pub(crate) fn specs_of(config: &HeadConfig, has: impl Fn(&str) -> bool) -> Resul
 }
 
 /// Every tensor that a checkpoint of a head of this config must hold, by its name without a prefix.
-///
-/// # Errors
-/// As [`tensor_shapes`].
 pub(crate) fn tensor_specs(config: &HeadConfig) -> Result<Vec<TensorSpec>> {
     // Any embodiment: they have the same tensors.
-    Ok(planned(config, &[0])?.specs)
+    Ok(head_plan(config, &[0])?.specs)
 }
 
-/// The tensors that a head with these embodiments reads, in the order in which it is built.
-///
-/// # Errors
-/// As [`tensor_shapes`].
-pub(crate) fn reading_order(config: &HeadConfig, embodiment_ids: &[usize]) -> Result<Vec<Wanted>> {
-    Ok(planned(config, embodiment_ids)?.wanted)
-}
-
-fn planned(config: &HeadConfig, ids: &[usize]) -> Result<Plan> {
+/// The tensors of a head with these embodiments, in the order in which it is built.
+pub(super) fn head_plan(config: &HeadConfig, ids: &[usize]) -> Result<Plan> {
     let count = config.num_embodiments;
     plan(|weights| HeadLayers::new(weights, config, Embodiments { ids, count }))
 }

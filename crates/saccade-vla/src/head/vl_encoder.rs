@@ -138,13 +138,8 @@ impl VlEncoder {
         recorded: &mut Recorded<usize>,
         workspace: &mut VlWorkspace,
     ) -> Result<Encoded> {
-        let &VlTokens {
-            features,
-            batch,
-            num_vl_tokens,
-            ..
-        } = tokens;
-        let len = features.num_rows() * features.num_columns();
+        let (batch, num_vl_tokens) = (tokens.batch, tokens.num_vl_tokens);
+        let len = batch * num_vl_tokens * self.context_dim;
         let mut vl_embs = filled("vl_embs", len, 0.0)?;
         let mut vl = RowsMut::new(&mut vl_embs, self.context_dim);
         let mut caches = Vec::new();
@@ -194,15 +189,14 @@ impl VlEncoder {
         caches: &mut [Vec<PackedKeyValues>],
         workspace: &mut VlWorkspace,
     ) -> Result<()> {
-        let VlWorkspace { gathered, hidden, .. } = workspace;
         for seen in tokens.seen {
             let counts = seen.counts(observations.clone(), tokens.num_vl_tokens);
-            let rows = seen.rows(observations.clone(), vl, gathered)?;
+            let rows = seen.rows(observations.clone(), vl, &mut workspace.gathered)?;
             for (block, caches) in tokens.cross.iter().zip(&mut *caches) {
                 if let Some((reads, attention)) = block
                     && *reads == seen.reads
                 {
-                    caches.extend(attention.project(kernels, rows, &counts, hidden)?);
+                    caches.extend(attention.project(kernels, rows, &counts, &mut workspace.hidden)?);
                 }
             }
         }
@@ -232,10 +226,7 @@ impl VlEncoder {
         }
         for (index, block) in self.blocks.iter().enumerate() {
             check_interrupted()?;
-            let VlWorkspace {
-                y, hidden, attention, ..
-            } = &mut *workspace;
-            let mut y = y.rows(vl.num_rows(), vl.num_columns())?;
+            let mut y = workspace.y.rows(vl.num_rows(), vl.num_columns())?;
             block.norm1.apply(kernels.engine, vl.as_rows(), y.reborrow())?;
             let sequences = Sequences::new(y.as_rows(), observations.len());
             let keys = SelfKeys {
@@ -248,11 +239,11 @@ impl VlEncoder {
             };
             block
                 .attention
-                .add_self(kernels, sequences, keys, attention, vl.reborrow())?;
+                .add_self(kernels, sequences, keys, &mut workspace.attention, vl.reborrow())?;
             block.norm3.apply(kernels.engine, vl.as_rows(), y.reborrow())?;
             block
                 .feed_forward
-                .add(kernels, y.as_rows(), hidden, vl.reborrow())?;
+                .add(kernels, y.as_rows(), &mut workspace.hidden, vl.reborrow())?;
             if let Some(recorded) = recorded.hidden(index) {
                 let recorded = RowsMut::new(recorded, self.context_dim);
                 recorded.rows(part(num_vl_tokens)).copy_from(vl.as_rows());

@@ -208,11 +208,9 @@ impl Attention {
         out: RowsMut<'_>,
     ) -> Result<()> {
         let CrossKeys {
-            caches,
-            subset,
-            bias,
-            mut probabilities,
+            caches, subset, bias, ..
         } = keys;
+        let mut probabilities = keys.probabilities;
         self.queries(kernels, y, workspace)?;
         let (q, mut mixed) = (workspace.q.as_rows(), workspace.mixed.as_rows_mut());
         // A shared bias is one sequence's, so each sequence is then a call of its own; otherwise those that
@@ -258,11 +256,9 @@ impl Attention {
         x: RowsMut<'_>,
     ) -> Result<()> {
         let SelfKeys {
-            source,
-            held,
-            bias,
-            mut probabilities,
+            source, held, bias, ..
         } = keys;
+        let mut probabilities = keys.probabilities;
         let engine = kernels.engine;
         self.queries(kernels, y, workspace)?;
         let (keys, values) = self.keys_values(kernels, source.rows, &mut workspace.kv)?;

@@ -149,14 +149,8 @@ impl GroupedAttention {
         let mut first = 0;
         match attended {
             Attended::Whole(lens) => {
-                let GroupedSizes {
-                    num_kv_heads,
-                    head_dim,
-                    ..
-                } = self.sizes;
-                let packed = workspace
-                    .packed
-                    .get_or_insert_with(|| kv_cache::empty(engine, num_kv_heads, head_dim));
+                let empty = || kv_cache::empty(engine, self.sizes.num_kv_heads, self.sizes.head_dim);
+                let packed = workspace.packed.get_or_insert_with(empty);
                 for len in lens {
                     attend.whole(first..first + len, packed)?;
                     first += len;

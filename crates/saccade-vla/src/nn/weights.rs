@@ -23,9 +23,6 @@ struct Builder<'a> {
 }
 
 /// The layers that `build` makes of a source, and their bytes.
-///
-/// # Errors
-/// Those of `build`.
 pub(crate) fn build<L>(
     source: &dyn Source,
     engine: Engine,

@@ -108,15 +108,11 @@ impl Vision {
         views: &[ViewPixels<'_>],
         workspace: &'a mut VisionWorkspace,
     ) -> Result<EncodedViews<'a>> {
-        let VisionWorkspace {
-            x,
-            patch_vectors,
-            block,
-            tokens,
-        } = workspace;
         let counts: Vec<usize> = views.iter().map(ViewPixels::num_patches).collect();
-        let mut rows = x.rows(counts.iter().sum(), config.vision.width)?;
+        let mut rows = workspace.x.rows(counts.iter().sum(), config.vision.width)?;
+        let patch_vectors = &mut workspace.patch_vectors;
         let rope = self.0.embed(kernels, views, patch_vectors, rows.reborrow())?;
+        let (block, tokens) = (&mut workspace.block, &mut workspace.tokens);
         let mut deepstack = Vec::new();
         for (index, layer) in self.0.blocks().iter().enumerate() {
             check_interrupted()?;
@@ -126,7 +122,7 @@ impl Vision {
                 deepstack.push(merger.tokens(kernels, joined, &mut tokens.connector)?);
             }
         }
-        let (patches, tokens) = self.0.tokens(kernels, views, x.as_rows(), tokens)?;
+        let (patches, tokens) = self.0.tokens(kernels, views, workspace.x.as_rows(), tokens)?;
         Ok(EncodedViews {
             patches,
             tokens,

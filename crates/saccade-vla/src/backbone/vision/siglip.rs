@@ -20,8 +20,7 @@ use crate::nn::weights::Weights;
 use crate::ops::check_interrupted;
 use crate::precision::Role;
 use crate::profile::Part;
-use crate::release::Names;
-use crate::release::{PatchOrder, PixelOrder};
+use crate::release::{Names, PatchOrder, PixelOrder};
 
 const BLOCK: BlockNames = BlockNames {
     norms: ["layer_norm1", "layer_norm2"],
@@ -173,19 +172,17 @@ impl VisionTower for Siglip {
         x: Rows<'a>,
         workspace: &'a mut TokensWorkspace,
     ) -> Result<(Rows<'a>, Vec<f32>)> {
-        let TokensWorkspace {
-            normed,
-            joined,
-            connector,
-        } = workspace;
+        let connector = &mut workspace.connector;
         let (width, patches_of_token) = (x.num_columns(), self.config.patches_of_token());
-        let y = normed.rows(x.num_rows(), width)?;
+        let y = workspace.normed.rows(x.num_rows(), width)?;
         self.post_layernorm.apply(kernels.engine, x, y)?;
-        let y = normed.as_rows();
+        let y = workspace.normed.as_rows();
         if self.config.merge == 1 {
             return Ok((y, self.connector.tokens(kernels, y, connector)?));
         }
-        let mut tokens = joined.rows(x.num_rows() / patches_of_token, patches_of_token * width)?;
+        let mut tokens = workspace
+            .joined
+            .rows(x.num_rows() / patches_of_token, patches_of_token * width)?;
         let mut first = 0;
         for view in views {
             let patches = first..first + view.num_patches();

@@ -14,9 +14,6 @@ use crate::nn::rope::Rope;
 pub(super) trait VisionTower {
     /// Writes `patches W^T + b + positions` to `x (patches, width)`; the angles by which heads are rotated,
     /// if they are.
-    ///
-    /// # Errors
-    /// [`Error::Memory`](crate::Error::Memory), [`Error::Interrupted`](crate::Error::Interrupted).
     fn embed(
         &self,
         kernels: &mut Kernels<'_>,
@@ -35,9 +32,6 @@ pub(super) trait VisionTower {
     }
 
     /// The patches after the last block, normed if the tower has a norm there, and the tokens made of them.
-    ///
-    /// # Errors
-    /// As [`Self::embed`].
     fn tokens<'a>(
         &self,
         kernels: &mut Kernels<'_>,

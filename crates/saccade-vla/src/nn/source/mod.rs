@@ -40,9 +40,6 @@ pub(crate) trait Source {
     fn give_back(&self, _used: Elements) {}
 
     /// Bytes of a layer packed from outlines.
-    ///
-    /// # Errors
-    /// As packing has them.
     fn packed_nbytes(&self, _role: Role, _outline: Outline) -> Result<usize> {
         Ok(0)
     }

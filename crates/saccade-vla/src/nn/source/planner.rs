@@ -29,9 +29,6 @@ pub(crate) struct Plan {
 }
 
 /// The requests of the layers that `build` makes.
-///
-/// # Errors
-/// Those of `build`.
 pub(crate) fn plan<L>(build: impl FnOnce(&Weights<'_>) -> Result<L>) -> Result<Plan> {
     let planner = Planner::default();
     let engine = Engine {

@@ -17,9 +17,6 @@ struct Sizer<D> {
 }
 
 /// Bytes of the layers that `build` makes, of tensors that are stored as `dtype` says by name.
-///
-/// # Errors
-/// Those of `build` and `dtype`.
 pub(crate) fn nbytes<L>(
     engine: Engine,
     dtype: impl Fn(&str) -> Result<Dtype>,
