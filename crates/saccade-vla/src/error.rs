@@ -131,25 +131,3 @@ impl Error {
         }
     }
 }
-
-#[cfg(test)]
-mod tests {
-    use std::error::Error as _;
-
-    use super::*;
-    use crate::ops::packing_error;
-
-    #[test]
-    fn causes_are_kept() {
-        let error = crate::config::HeadConfig::from_json("{").unwrap_err();
-        assert!(error.source().unwrap().is::<serde_json::Error>());
-        assert_eq!(error.kind(), ErrorKind::Checkpoint);
-        assert!(
-            error.to_string().starts_with("config: not valid JSON: "),
-            "{error}"
-        );
-        let error = packing_error(KernelError::TooManyInputs { given: 70_000 });
-        assert!(error.source().unwrap().is::<KernelError>());
-        assert_eq!(error.kind(), ErrorKind::Checkpoint);
-    }
-}

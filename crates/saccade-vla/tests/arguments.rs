@@ -2,10 +2,13 @@
 
 mod common;
 
+use std::error::Error as _;
+
 use saccade_vla::{
-    ActionHead, Array, ArrayMut, CrossAttention, ElementsRef, Error, Features, KeyOptions, LoadOptions,
-    NoisyActions, OwnedArray, Precision, Sampling, TensorView, TensorViews,
+    ActionHead, Array, ArrayMut, CrossAttention, ElementsRef, Error, ErrorKind, Features, HeadConfig,
+    KeyOptions, LoadOptions, NoisyActions, OwnedArray, Precision, Sampling, TensorView, TensorViews,
 };
+use saccade_vla_kernels::KernelError;
 
 fn demo() -> ActionHead {
     let options = LoadOptions {
@@ -160,4 +163,33 @@ fn a_shape_that_does_not_fit_is_an_error() {
         let expected = format!("shape: {shown} does not fit 6 elements");
         assert_eq!(messages, [expected.clone(), expected.clone(), expected]);
     }
+}
+
+#[test]
+fn causes_are_kept() {
+    let error = HeadConfig::from_json("{").unwrap_err();
+    assert!(error.source().unwrap().is::<serde_json::Error>());
+    assert_eq!(error.kind(), ErrorKind::Checkpoint);
+    assert!(
+        error.to_string().starts_with("config: not valid JSON: "),
+        "{error}"
+    );
+    // More inputs than sums of products of int8 hold.
+    let weight = vec![0.0; 70_000];
+    let tensors: TensorViews<'_> = [("to_q", 1), ("to_k", 70_000), ("to_v", 70_000), ("to_out.0", 1)]
+        .into_iter()
+        .flat_map(|(layer, inputs)| {
+            let view =
+                |shape: &[usize], len| TensorView::new(shape, ElementsRef::F32(&weight[..len])).unwrap();
+            [
+                (format!("{layer}.weight"), view(&[1, inputs], inputs)),
+                (format!("{layer}.bias"), view(&[1], 1)),
+            ]
+        })
+        .collect();
+    let error = CrossAttention::new(&tensors, 1, Precision::Int8, Some(1))
+        .err()
+        .unwrap();
+    assert!(error.source().unwrap().is::<KernelError>());
+    assert_eq!(error.kind(), ErrorKind::Checkpoint);
 }

@@ -7,14 +7,14 @@ use serde_json::json;
 
 use super::version::Version;
 use crate::array::{Array, ArrayMut};
-use crate::backbone::{Backbone, BackboneKeep, BackboneLoadOptions, published_specs};
+use crate::backbone::{Backbone, BackboneLoadOptions, published_specs};
 use crate::config::HeadConfig;
 use crate::head::action_head::ActionHead;
-use crate::head::encode::Features;
 use crate::head::load::LoadOptions;
 use crate::head::plan::tensor_shapes;
 use crate::head::sample::Sampling;
-use crate::processor::{Frame, Observation, Prepared, Processor, ProcessorSource};
+use crate::policy::Policy;
+use crate::processor::{Frame, Observation, ProcessorSource};
 use crate::recognise::HeadCheckpoint;
 
 const CONFIG: &str = r#"{
@@ -64,18 +64,6 @@ fn checkpoint(version: Version) -> Directory {
     Directory(directory)
 }
 
-/// A frame of 40 x 24 pixels and an instruction, prepared.
-fn prepared(processor: &Processor) -> Prepared {
-    let pixels: Vec<u8> = (0..40 * 24 * 3).map(|index| (index % 251) as u8).collect();
-    let frame = Frame::U8(Array::new(&pixels, &[40, 24, 3]).unwrap());
-    let observation = Observation {
-        views: vec![(Some("front"), frame)],
-        instruction: Some("Lift the CUP."),
-        ..Observation::default()
-    };
-    processor.process(&[observation]).unwrap()
-}
-
 #[test]
 fn a_made_up_release_needs_its_row_only() {
     let version: Version = "n1.9".parse().unwrap();
@@ -92,7 +80,14 @@ fn a_made_up_release_needs_its_row_only() {
         (version, &["nobody/n1d9"][..])
     );
     let processor = source.processor(None, None, None).unwrap();
-    let prepared = prepared(&processor);
+    let pixels: Vec<u8> = (0..40 * 24 * 3).map(|index| (index % 251) as u8).collect();
+    let frame = Frame::U8(Array::new(&pixels, &[40, 24, 3]).unwrap());
+    let observations = [Observation {
+        views: vec![(Some("front"), frame)],
+        instruction: Some("Lift the CUP."),
+        ..Observation::default()
+    }];
+    let prepared = processor.process(&observations).unwrap();
     // 20 x 12 pixels have the greatest area; 16 x 8 are whole tokens.
     let pixels = &prepared.pixel_values[0];
     assert_eq!(pixels.shape(), [1, 3, 16, 8]);
@@ -104,32 +99,20 @@ fn a_made_up_release_needs_its_row_only() {
 
     let backbone = Backbone::load(path, &BackboneLoadOptions::default()).unwrap();
     assert_eq!(backbone.config().version, version);
-    let encoded = backbone
-        .encode(&[prepared.as_inputs()], &[], BackboneKeep::default())
-        .unwrap();
-    let features = &encoded[0];
-
     let head = ActionHead::load(path, &LoadOptions::default()).unwrap();
-    let rows = features.all_features().unwrap();
-    let batch = prepared.input_ids.shape();
-    let shape = [1, batch[1], features.feature_dim()];
-    let image = i64::from(processor.image_token_id());
-    let is_image: Vec<bool> = prepared.input_ids.data().iter().map(|id| *id == image).collect();
-    let features = Features {
-        image_mask: Some(Array::new(&is_image, batch).unwrap()),
-        ..Features::new(Array::new(&rows, &shape).unwrap())
-    };
-    let context = head.encode(&features).unwrap();
+    let policy = Policy::new(processor, backbone, head);
+    let context = policy.encode(&observations, None).unwrap();
+    assert_eq!(context.num_vl_tokens(), prepared.input_ids.shape()[1]);
     let mut actions = [f32::NAN; 24];
-    head.sample(
+    let sampled = policy.sample(
         &context,
         Array::new(&[0.5; 5], &[1, 5]).unwrap(),
         Array::new(&[1], &[1]).unwrap(),
         Array::new(&[0.25; 24], &[1, 4, 6]).unwrap(),
         &Sampling::default(),
         ArrayMut::new(&mut actions, &[1, 4, 6]).unwrap(),
-    )
-    .unwrap();
+    );
+    sampled.unwrap();
     assert!(actions.iter().all(|action| action.is_finite() && *action != 0.25));
 }
 

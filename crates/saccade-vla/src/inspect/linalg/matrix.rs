@@ -27,14 +27,16 @@ impl Matrix {
 
     /// An argument with two axes, at least one element and no NaN or infinity.
     pub(super) fn checked(name: &'static str, axes: &str, array: Array<'_, f64>) -> Result<Self> {
-        let (rows, columns) = match *array.shape() {
-            [rows, columns] if rows > 0 && columns > 0 => (rows, columns),
-            ref other => {
-                return Err(Error::Shape(problem!(
-                    name; expected "two axes, {axes}, of at least one element"; got "{}", show_shape(other)
-                )));
-            }
+        let [rows, columns] = *array.shape() else {
+            return Err(Error::Shape(problem!(
+                name; expected "two axes, {axes}"; got "{}", show_shape(array.shape())
+            )));
         };
+        if rows == 0 || columns == 0 {
+            return Err(Error::Shape(problem!(
+                name; expected "{axes} of at least one element"; got "{}", show_shape(array.shape())
+            )));
+        }
         if let Some(position) = array.data().iter().position(|value| !value.is_finite()) {
             return Err(Error::Input(problem!(
                 name; expected "finite values";
