@@ -39,16 +39,14 @@ impl Policy {
             .map(|(observation, plain_text)| observation.view(*plain_text))
             .collect::<PyResult<Vec<_>>>()?;
         let previous = previous.map(|(context, features)| {
-            PolicyContext::new(
-                context.0,
-                features.into_iter().map(|features| features.0).collect(),
-            )
+            let features = features.into_iter().map(|features| features.0).collect();
+            PolicyContext {
+                context: context.0,
+                features,
+            }
         });
         let encoded = call(py, || self.0.encode(&observations, previous.as_ref()))?;
-        let features = encoded.features().iter().map(Arc::clone);
-        Ok((
-            Context(Arc::clone(encoded.context())),
-            features.map(BackboneFeatures).collect(),
-        ))
+        let features = encoded.features.into_iter().map(BackboneFeatures);
+        Ok((Context(encoded.context), features.collect()))
     }
 }

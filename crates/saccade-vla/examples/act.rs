@@ -26,7 +26,7 @@ fn picture(column: usize) -> Vec<u8> {
 
 /// Four steps from noise to a chunk of actions, `(action_horizon, action_dim)`, for a robot at rest.
 fn act(policy: &Policy, context: &PolicyContext) -> Result<Vec<f32>> {
-    let config = policy.head().config();
+    let config = policy.head.config();
     let state_shape = [1, config.num_states, config.state_dim];
     let noise_shape = [1, config.action_horizon, config.encoder_action_dim];
     let shape = [1, config.action_horizon, config.action_dim];
@@ -39,7 +39,7 @@ fn act(policy: &Policy, context: &PolicyContext) -> Result<Vec<f32>> {
     policy.sample(
         context,
         Array::new(&state, &state_shape)?,
-        Array::new(&[policy.head().embodiment_ids()[0] as i64], &[1])?,
+        Array::new(&[policy.head.embodiment_ids()[0] as i64], &[1])?,
         Array::new(&noise, &noise_shape)?,
         &Sampling {
             num_steps: Some(4),
@@ -83,7 +83,7 @@ fn main() -> Result<()> {
     let context = policy.encode(&told("pick up the red block"), None)?;
     println!("{} tokens", context.num_vl_tokens());
     let actions = act(&policy, &context)?;
-    for (step, action) in actions.chunks(policy.head().config().action_dim).enumerate() {
+    for (step, action) in actions.chunks(policy.head.config().action_dim).enumerate() {
         let shown: Vec<String> = action.iter().map(|value| format!("{value:7.3}")).collect();
         println!("action {step:2}: {}", shown.join(" "));
     }

@@ -237,6 +237,12 @@ pub(crate) fn first_not_finite(data: &[f32]) -> Option<usize> {
     first_where(data, |value| value.to_bits() & EXPONENT == EXPONENT)
 }
 
+/// The first value that is no bias of logits, which are below infinity; minus infinity takes a key away.
+pub(crate) fn first_not_bias(values: &[f32]) -> Option<f32> {
+    let is_bad = |value: &f32| value.is_nan() || *value == f32::INFINITY;
+    values.iter().copied().find(is_bad)
+}
+
 /// Elements that are looked at together: a loop without exits is one that compilers turn into vector code.
 const TOGETHER: usize = 1024;
 

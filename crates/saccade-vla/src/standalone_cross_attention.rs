@@ -4,7 +4,7 @@
 use saccade_vla_kernels::{Epilogue, LinearScratch, PackedKeyValues, Rows, RowsMut};
 
 use crate::alloc::{Scratch, collected, filled, product};
-use crate::array::{Array, ArrayMut};
+use crate::array::{Array, ArrayMut, first_not_bias};
 use crate::engine::{Engine, Kernels};
 use crate::error::{Error, Problem, Result, problem, show_shape};
 use crate::nn::attention::{Attention, AttentionWorkspace, Bias, CrossKeys};
@@ -258,11 +258,7 @@ fn logit_bias(
         None => filled("key_mask", product("key_mask", &shape)?, 0.0)?,
         Some(bias) => {
             bias.check_shape("key_bias", axes, &shape)?;
-            if let Some(bad) = bias
-                .data()
-                .iter()
-                .find(|value| value.is_nan() || **value == f32::INFINITY)
-            {
+            if let Some(bad) = first_not_bias(bias.data()) {
                 return Err(Error::Input(problem!(
                     "key_bias"; expected "finite values or minus infinity"; got "{bad}"
                 )));

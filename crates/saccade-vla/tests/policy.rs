@@ -50,7 +50,7 @@ fn observation<'a>(pictures: &'a [Vec<u8>], words: &'a str) -> Observation<'a> {
 
 /// What is sampled for each observation from the same noise, with the state in the middle of its range.
 fn actions(policy: &Policy, context: &PolicyContext) -> Vec<Vec<f32>> {
-    let config = policy.head().config();
+    let config = policy.head.config();
     let batch = context.batch();
     let state_shape = [batch, config.num_states, config.state_dim];
     let noise_shape = [batch, config.action_horizon, config.encoder_action_dim];
@@ -78,9 +78,9 @@ fn one_call_is_the_parts_one_after_the_other() {
     let policy = demo();
     let pictures = [1, 2, 3].map(picture);
     let seen = observation(&pictures, "open the drawer");
-    let prepared = policy.processor().process(std::slice::from_ref(&seen)).unwrap();
+    let prepared = policy.processor.process(std::slice::from_ref(&seen)).unwrap();
     let features = policy
-        .backbone()
+        .backbone
         .encode(&[prepared.as_inputs()], &[], BackboneKeep::default())
         .unwrap();
     let shape = [1, features[0].num_tokens(), features[0].feature_dim()];
@@ -88,19 +88,19 @@ fn one_call_is_the_parts_one_after_the_other() {
         .input_ids
         .data()
         .iter()
-        .map(|&id| id == i64::from(policy.processor().image_token_id()))
+        .map(|&id| id == i64::from(policy.processor.image_token_id()))
         .collect();
     let given = Features {
         image_mask: Some(Array::new(&image_mask, &shape[..2]).unwrap()),
         ..Features::new(Array::new(features[0].features(0), &shape).unwrap())
     };
-    let expected = policy.head().encode(&given).unwrap();
+    let expected = policy.head.encode(&given).unwrap();
 
     let found = policy.encode(&[seen], None).unwrap();
     assert_eq!((found.batch(), found.num_vl_tokens()), (1, shape[1]));
-    assert!(found.features()[0].features(0) == features[0].features(0));
-    assert!(found.context().vl_embs() == expected.vl_embs());
-    assert_eq!(found.context().image_mask(), Some(&image_mask[..]));
+    assert!(found.features[0].features(0) == features[0].features(0));
+    assert!(found.context.vl_embs() == expected.vl_embs());
+    assert_eq!(found.context.image_mask(), Some(&image_mask[..]));
 }
 
 #[test]
@@ -123,13 +123,13 @@ fn each_of_several_has_the_bits_that_it_has_alone() {
         let reused = policy
             .encode(std::slice::from_ref(seen), Some(&together))
             .unwrap();
-        let features = together.features()[index].features(0);
-        let width = together.features()[index].feature_dim();
-        let rows = &together.context().vl_embs()[index * together.num_vl_tokens() * width..];
+        let features = together.features[index].features(0);
+        let width = together.features[index].feature_dim();
+        let rows = &together.context.vl_embs()[index * together.num_vl_tokens() * width..];
         for context in [&alone, &reused] {
-            assert!(context.features()[0].features(0) == features);
+            assert!(context.features[0].features(0) == features);
             assert!(
-                context.context().vl_embs() == &rows[..features.len()],
+                context.context.vl_embs() == &rows[..features.len()],
                 "observation {index}"
             );
             assert!(
@@ -138,7 +138,7 @@ fn each_of_several_has_the_bits_that_it_has_alone() {
             );
         }
     }
-    let lengths: Vec<usize> = together.features().iter().map(|one| one.num_tokens()).collect();
+    let lengths: Vec<usize> = together.features.iter().map(|one| one.num_tokens()).collect();
     assert!(lengths.iter().any(|length| length != &lengths[0]));
 }
 
@@ -147,15 +147,15 @@ fn features_from_elsewhere_are_checked() {
     let policy = demo();
     let pictures = [picture(1)];
     let encoded = policy.encode(&[observation(&pictures, "push")], None).unwrap();
-    let features: [&BackboneFeatures; 1] = [&encoded.features()[0]];
+    let features: [&BackboneFeatures; 1] = [&encoded.features[0]];
     let batch = FeatureBatch::new(&features).unwrap();
     let mut given = batch.as_features();
-    assert!(policy.head().encode(&given).is_ok());
+    assert!(policy.head.encode(&given).is_ok());
     // Those of the batch are known to be finite; others in their place are not.
     let mut other = given.backbone_features.data().to_vec();
     other[7] = f32::NAN;
     given.backbone_features = Array::new(&other, given.backbone_features.shape()).unwrap();
-    let error = policy.head().encode(&given).err().unwrap().to_string();
+    let error = policy.head.encode(&given).err().unwrap().to_string();
     assert!(
         error.starts_with("backbone_features: expected finite values, got NaN"),
         "{error}"
@@ -212,7 +212,7 @@ fn callers_at_the_same_time_get_the_same_bits() {
                 let found = policy
                     .encode(&[observation(&pictures, "push")], Some(&expected))
                     .unwrap();
-                assert!(found.context().vl_embs() == expected.context().vl_embs());
+                assert!(found.context.vl_embs() == expected.context.vl_embs());
             });
         }
     });

@@ -100,29 +100,11 @@ fn is_of_sizes(object: &Object) -> bool {
         .any(|key| object.contains_key(*key))
 }
 
-/// Where a key is looked up.
-#[derive(Clone, Copy, PartialEq, Eq)]
-enum Section {
-    Vision,
-    Text,
-    Eagle,
-    Tokens,
-}
-
-impl Section {
-    fn key(self) -> &'static str {
-        match self {
-            Self::Vision => "vision_config",
-            Self::Text => "text_config",
-            Self::Eagle => "eagle",
-            Self::Tokens => "token_ids",
-        }
-    }
-
-    fn path(self, key: &str) -> String {
-        format!("{}.{key}", self.key())
-    }
-}
+/// The keys of the parts in which a size is looked up.
+const VISION: &str = "vision_config";
+const TEXT: &str = "text_config";
+const EAGLE: &str = "eagle";
+const TOKENS: &str = "token_ids";
 
 /// Reads keys and collects all problems, so that one error lists everything.
 struct Reader<'a> {
@@ -133,8 +115,7 @@ struct Reader<'a> {
 
 impl Reader<'_> {
     fn config(&mut self, version: Version, rules: &BackboneRules) -> BackboneConfig {
-        for section in [Section::Vision, Section::Text, Section::Eagle, Section::Tokens] {
-            let key = section.key();
+        for key in [VISION, TEXT, EAGLE, TOKENS] {
             if self.given.sizes.get(key).is_some_and(|value| !value.is_object()) {
                 self.problems.add(format!("{key}: expected an object"));
             }
@@ -151,24 +132,23 @@ impl Reader<'_> {
     }
 
     fn vision(&mut self, rules: &BackboneRules) -> VisionConfig {
-        use Section::{Eagle, Vision};
         let [layers, heads] = match rules.tower {
             TowerKind::Siglip { .. } => ["num_hidden_layers", "num_attention_heads"],
             TowerKind::Qwen3Vl => ["depth", "num_heads"],
         };
-        self.expect(Vision, "hidden_act", "gelu_pytorch_tanh");
+        self.expect(VISION, "hidden_act", "gelu_pytorch_tanh");
         for key in ["num_channels", "in_channels"] {
-            self.expect(Vision, key, CHANNELS);
+            self.expect(VISION, key, CHANNELS);
         }
-        self.expect(Vision, "use_rope", false);
-        let (width, num_heads) = (self.size(Vision, "hidden_size"), self.size(Vision, heads));
-        let patch_size = self.size(Vision, "patch_size");
+        self.expect(VISION, "use_rope", false);
+        let (width, num_heads) = (self.size(VISION, "hidden_size"), self.size(VISION, heads));
+        let patch_size = self.size(VISION, "patch_size");
         let mut config = VisionConfig {
             width,
-            num_layers: self.within(Vision, layers, 1..=MAX_LAYERS),
+            num_layers: self.within(VISION, layers, 1..=MAX_LAYERS),
             num_heads,
             head_dim: width / num_heads,
-            hidden_dim: self.size(Vision, "intermediate_size"),
+            hidden_dim: self.size(VISION, "intermediate_size"),
             norm_eps: 1e-6,
             patch_size,
             image_size: None,
@@ -188,41 +168,40 @@ impl Reader<'_> {
                 is_fixed,
             } => {
                 config.tower = Tower::Siglip { pixels, patches };
-                config.norm_eps = self.number(Vision, "layer_norm_eps");
+                config.norm_eps = self.number(VISION, "layer_norm_eps");
                 if is_fixed {
-                    let image_size = self.size(Vision, "image_size");
+                    let image_size = self.size(VISION, "image_size");
                     config.image_size = Some(image_size);
                     config.num_positions = (image_size / patch_size) * (image_size / patch_size);
                 } else {
-                    config.num_positions = self.size(Vision, "num_patches");
+                    config.num_positions = self.size(VISION, "num_patches");
                 }
-                if self.flag(Eagle, "use_pixel_shuffle") {
-                    self.expect(Eagle, "downsample_ratio", 0.5);
+                if self.flag(EAGLE, "use_pixel_shuffle") {
+                    self.expect(EAGLE, "downsample_ratio", 0.5);
                     config.merge = 2;
                 }
-                config.connector_layers = self.within(Eagle, "mlp_connector_layers", 1..=2);
+                config.connector_layers = self.within(EAGLE, "mlp_connector_layers", 1..=2);
                 self.expect_last_vision_layer();
             }
             TowerKind::Qwen3Vl => {
-                let frames = self.within(Vision, "temporal_patch_size", 1..=16);
+                let frames = self.within(VISION, "temporal_patch_size", 1..=16);
                 config.tower = Tower::Qwen3Vl {
                     patch_elements: CHANNELS * frames * patch_size * patch_size,
                     frames,
                 };
-                config.num_positions = self.size(Vision, "num_position_embeddings");
-                config.merge = self.within(Vision, "spatial_merge_size", 1..=16);
-                config.deepstack = self.sizes(Vision, "deepstack_visual_indexes");
+                config.num_positions = self.size(VISION, "num_position_embeddings");
+                config.merge = self.within(VISION, "spatial_merge_size", 1..=16);
+                config.deepstack = self.sizes(VISION, "deepstack_visual_indexes");
             }
         }
         config
     }
 
     fn language(&mut self, rules: &BackboneRules) -> LanguageConfig {
-        use Section::Text;
-        self.expect(Text, "hidden_act", "silu");
-        self.expect(Text, "attention_bias", false);
-        self.expect(Text, "use_sliding_window", false);
-        let mrope_section = match self.value(Text, "rope_scaling") {
+        self.expect(TEXT, "hidden_act", "silu");
+        self.expect(TEXT, "attention_bias", false);
+        self.expect(TEXT, "use_sliding_window", false);
+        let mrope_section = match self.value(TEXT, "rope_scaling") {
             Some(Value::Object(scaling)) => self.mrope_section(&scaling),
             None | Some(Value::Null) => None,
             Some(_) => {
@@ -232,15 +211,15 @@ impl Reader<'_> {
             }
         };
         LanguageConfig {
-            width: self.size(Text, "hidden_size"),
+            width: self.size(TEXT, "hidden_size"),
             num_layers: self.select_layer(),
-            num_heads: self.size(Text, "num_attention_heads"),
-            num_kv_heads: self.size(Text, "num_key_value_heads"),
-            head_dim: self.size(Text, "head_dim"),
-            hidden_dim: self.size(Text, "intermediate_size"),
-            vocab_size: self.size(Text, "vocab_size"),
-            norm_eps: self.number(Text, "rms_norm_eps"),
-            rope_theta: self.number(Text, "rope_theta"),
+            num_heads: self.size(TEXT, "num_attention_heads"),
+            num_kv_heads: self.size(TEXT, "num_key_value_heads"),
+            head_dim: self.size(TEXT, "head_dim"),
+            hidden_dim: self.size(TEXT, "intermediate_size"),
+            vocab_size: self.size(TEXT, "vocab_size"),
+            norm_eps: self.number(TEXT, "rms_norm_eps"),
+            rope_theta: self.number(TEXT, "rope_theta"),
             mrope_section,
             has_final_norm: rules.has_final_norm,
         }
@@ -288,8 +267,8 @@ impl Reader<'_> {
 
     fn image_token_id(&mut self, rules: &BackboneRules) -> usize {
         let (section, key) = match rules.tower {
-            TowerKind::Siglip { .. } => (Section::Eagle, "image_token_index"),
-            TowerKind::Qwen3Vl => (Section::Tokens, "image_token_id"),
+            TowerKind::Siglip { .. } => (EAGLE, "image_token_index"),
+            TowerKind::Qwen3Vl => (TOKENS, "image_token_id"),
         };
         self.within(section, key, 0..=MAX_SIZE)
     }
@@ -313,51 +292,52 @@ impl Reader<'_> {
     }
 
     /// The value of a key: as it is given, or else as it was released.
-    fn value(&self, section: Section, key: &str) -> Option<Value> {
+    fn value(&self, section: &str, key: &str) -> Option<Value> {
         let sizes = &self.given.sizes;
-        let of = |object: &Object| object.get(section.key()).and_then(|part| part.get(key)).cloned();
+        let of = |object: &Object| object.get(section).and_then(|part| part.get(key)).cloned();
         let beside = match section {
-            Section::Eagle | Section::Tokens => sizes.get(key).cloned(),
-            Section::Vision | Section::Text => None,
+            EAGLE | TOKENS => sizes.get(key).cloned(),
+            _ => None,
         };
         of(sizes).or(beside).or_else(|| of(&self.released))
     }
 
     /// A key that may be absent, but if present must have a value that the released code was run with.
-    fn expect(&mut self, section: Section, key: &str, expected: impl Into<Value>) {
+    fn expect(&mut self, section: &str, key: &str, expected: impl Into<Value>) {
         let (given, expected) = (self.value(section, key), expected.into());
         if given.as_ref().is_some_and(|given| *given != expected) {
             self.problems
-                .differs(&section.path(key), given.as_ref(), &expected.to_string());
+                .differs(&format!("{section}.{key}"), given.as_ref(), &expected.to_string());
         }
     }
 
-    fn size(&mut self, section: Section, key: &str) -> usize {
+    fn size(&mut self, section: &str, key: &str) -> usize {
         self.within(section, key, 1..=MAX_SIZE)
     }
 
-    fn within(&mut self, section: Section, key: &str, sizes: RangeInclusive<u64>) -> usize {
+    fn within(&mut self, section: &str, key: &str, sizes: RangeInclusive<u64>) -> usize {
         let given = self.value(section, key);
-        self.problems.whole(&section.path(key), given.as_ref(), sizes)
+        self.problems
+            .whole(&format!("{section}.{key}"), given.as_ref(), sizes)
     }
 
-    fn sizes(&mut self, section: Section, key: &str) -> Vec<usize> {
+    fn sizes(&mut self, section: &str, key: &str) -> Vec<usize> {
         let given = self.value(section, key);
         given.as_ref().and_then(whole_numbers).unwrap_or_else(|| {
-            let path = section.path(key);
             self.problems
-                .add(format!("{path}: expected a list of whole numbers"));
+                .add(format!("{section}.{key}: expected a list of whole numbers"));
             Vec::new()
         })
     }
 
-    fn number(&mut self, section: Section, key: &str) -> f64 {
+    fn number(&mut self, section: &str, key: &str) -> f64 {
         let given = self.value(section, key);
-        self.problems.positive(&section.path(key), given.as_ref())
+        self.problems
+            .positive(&format!("{section}.{key}"), given.as_ref())
     }
 
-    fn flag(&mut self, section: Section, key: &str) -> bool {
+    fn flag(&mut self, section: &str, key: &str) -> bool {
         let given = self.value(section, key);
-        self.problems.flag(&section.path(key), given.as_ref())
+        self.problems.flag(&format!("{section}.{key}"), given.as_ref())
     }
 }

@@ -3,6 +3,7 @@
 use super::call_sizes::CallSizes;
 use super::groups::{Group, Tokens, check_indices};
 use super::intervention::Intervention;
+use crate::array::first_not_bias;
 use crate::config::HeadConfig;
 use crate::error::{Error, Result, problem, show_shape};
 
@@ -27,6 +28,7 @@ pub(super) fn check(intervention: &Intervention, sizes: &CallSizes<'_>) -> Resul
         }
         check_indices(name, indices, count)?;
     }
+    let blocks = intervention.blocks.as_deref();
     for (reader, source) in &intervention.cut {
         if reader.group == Group::Vl {
             return Err(Error::Input(problem!(
@@ -37,30 +39,20 @@ pub(super) fn check(intervention: &Intervention, sizes: &CallSizes<'_>) -> Resul
             check_not_empty("cut", tokens, groups.check("cut", tokens)?)?;
         }
         let edge = format!("{} reads {}", reader.group.name(), source.group.name());
-        check_acts("cut", &edge, source.group, intervention.blocks.as_deref(), config)?;
+        check_acts("cut", &edge, source.group, blocks, config)?;
     }
     for (tokens, bias) in &intervention.key_bias {
         let count = groups.check("key_bias", tokens)?;
         check_not_empty("key_bias", tokens, count)?;
         let keys = format!("{} is read", tokens.group.name());
-        check_acts(
-            "key_bias",
-            &keys,
-            tokens.group,
-            intervention.blocks.as_deref(),
-            config,
-        )?;
+        check_acts("key_bias", &keys, tokens.group, blocks, config)?;
         if !bias.shape().is_empty() && bias.shape() != [count] {
             return Err(Error::Shape(problem!(
                 "key_bias"; expected "a number or ({count},) for {}", tokens.group.name();
                 got "{}", show_shape(bias.shape())
             )));
         }
-        if let Some(bad) = bias
-            .data()
-            .iter()
-            .find(|value| value.is_nan() || **value == f32::INFINITY)
-        {
+        if let Some(bad) = first_not_bias(bias.data()) {
             return Err(Error::Input(problem!(
                 "key_bias"; expected "numbers below infinity"; got "{bad}"
             )));

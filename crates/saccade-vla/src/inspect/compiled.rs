@@ -10,6 +10,7 @@ use super::check::{check, check_not_empty, is_read};
 use super::groups::{Group, Groups, check_indices};
 use super::intervention::{Intervention, Patch};
 use crate::alloc::{filled, product, reserve};
+use crate::array::first_not_bias;
 use crate::error::{Error, Result, problem, show_shape};
 
 /// All interventions of one call, in the form in which blocks use them.
@@ -153,11 +154,7 @@ impl<'a> CompiledInterventions<'a> {
             bias.add(intervention, &groups, is_cross);
         }
         // Each is below infinity; a sum of several may still reach it.
-        if bias
-            .values
-            .iter()
-            .any(|value| value.is_nan() || *value == f32::INFINITY)
-        {
+        if first_not_bias(&bias.values).is_some() {
             return Err(Error::Input(problem!(
                 "key_bias"; "expected biases whose sum for a key is below infinity"
             )));
@@ -216,12 +213,8 @@ fn acts(intervention: &Intervention, step: usize, block: usize, is_cross: bool) 
 impl DenseBias {
     /// Adds the cuts and biases of an intervention.
     fn add(&mut self, intervention: &Intervention, groups: &Groups, is_cross: bool) {
-        let is_chosen = |head: &usize| {
-            intervention
-                .heads
-                .as_ref()
-                .is_none_or(|heads| heads.contains(head))
-        };
+        let chosen = intervention.heads.as_ref();
+        let is_chosen = |head: &usize| chosen.is_none_or(|heads| heads.contains(head));
         let heads: Vec<usize> = (0..self.heads).filter(is_chosen).collect();
         let everyone: Vec<usize> = (0..self.rows).collect();
         let mut add = |readers: &[usize], keys: &[usize], values: &dyn Fn(usize) -> f32| {
@@ -243,14 +236,11 @@ impl DenseBias {
         }
         for (tokens, bias) in &intervention.key_bias {
             if is_read(tokens, is_cross) {
-                add(
-                    &everyone,
-                    &groups.positions(tokens),
-                    &|index| match bias.shape() {
-                        [] => bias.data()[0],
-                        _ => bias.data()[index],
-                    },
-                );
+                let of_key = |index: usize| match bias.data() {
+                    [one] => *one,
+                    several => several[index],
+                };
+                add(&everyone, &groups.positions(tokens), &of_key);
             }
         }
     }

@@ -36,37 +36,24 @@ pub use load::PolicyLoadOptions;
 /// ```
 #[derive(Clone)]
 pub struct Policy {
-    processor: Arc<Processor>,
-    backbone: Arc<Backbone>,
-    head: Arc<ActionHead>,
+    /// The processor of frames and words.
+    pub processor: Arc<Processor>,
+    /// The vision-language backbone.
+    pub backbone: Arc<Backbone>,
+    /// The action head.
+    pub head: Arc<ActionHead>,
 }
 
 /// Encoded observations of a policy. Immutable; serves any number of calls and threads.
 #[derive(Clone)]
 pub struct PolicyContext {
-    context: Arc<Context>,
-    features: Vec<Arc<BackboneFeatures>>,
+    /// The head's context: shorter observations padded, and the padding dropped.
+    pub context: Arc<Context>,
+    /// The backbone's features of each observation, that it was made from.
+    pub features: Vec<Arc<BackboneFeatures>>,
 }
 
 impl PolicyContext {
-    /// The head's context of observations, and the features of each that it was made from.
-    #[must_use]
-    pub fn new(context: Arc<Context>, features: Vec<Arc<BackboneFeatures>>) -> Self {
-        Self { context, features }
-    }
-
-    /// The head's context: shorter observations padded, and the padding dropped.
-    #[must_use]
-    pub fn context(&self) -> &Arc<Context> {
-        &self.context
-    }
-
-    /// The backbone's features of each observation.
-    #[must_use]
-    pub fn features(&self) -> &[Arc<BackboneFeatures>] {
-        &self.features
-    }
-
     /// Number of observations.
     #[must_use]
     pub fn batch(&self) -> usize {
@@ -95,24 +82,6 @@ impl Policy {
         }
     }
 
-    /// The processor of frames and words.
-    #[must_use]
-    pub fn processor(&self) -> &Processor {
-        &self.processor
-    }
-
-    /// The vision-language backbone.
-    #[must_use]
-    pub fn backbone(&self) -> &Backbone {
-        &self.backbone
-    }
-
-    /// The action head.
-    #[must_use]
-    pub fn head(&self) -> &ActionHead {
-        &self.head
-    }
-
     /// Encodes observations, which need not agree in their views or in the length of their prompts. Each has the
     /// bits that it has alone.
     ///
@@ -134,8 +103,8 @@ impl Policy {
                 "none",
             )));
         }
-        let previous = previous.map_or(&[][..], PolicyContext::features);
-        let previous: Vec<&BackboneFeatures> = previous.iter().map(|features| &**features).collect();
+        let previous = previous.into_iter().flat_map(|previous| &previous.features);
+        let previous: Vec<&BackboneFeatures> = previous.map(|features| &**features).collect();
         let features = {
             let prepared = observations
                 .iter()
@@ -149,8 +118,10 @@ impl Policy {
             let features: Vec<&BackboneFeatures> = features.iter().collect();
             self.head.encode(&FeatureBatch::new(&features)?.as_features())?
         };
-        let features = features.into_iter().map(Arc::new).collect();
-        Ok(PolicyContext::new(Arc::new(context), features))
+        Ok(PolicyContext {
+            context: Arc::new(context),
+            features: features.into_iter().map(Arc::new).collect(),
+        })
     }
 
     /// Samples chunks of normalised actions, as [`ActionHead::sample`] does.
