@@ -259,14 +259,7 @@ impl<'a, T> RowsMut<'a, T> {
         num_columns: usize,
         row_stride: usize,
     ) -> Self {
-        Self::of(
-            first,
-            RowShape {
-                num_rows,
-                num_columns,
-                row_stride,
-            },
-        )
+        Self::of(first, RowShape::new(num_rows, num_columns, row_stride))
     }
 
     fn of(first: *mut T, shape: RowShape) -> Self {

@@ -11,6 +11,16 @@ pub(super) struct RowShape {
 }
 
 impl RowShape {
+    /// Rows without elements are all at the beginning, wherever that is: no pointer to one is outside the data.
+    #[inline]
+    pub(super) fn new(num_rows: usize, num_columns: usize, row_stride: usize) -> Self {
+        Self {
+            num_rows,
+            num_columns,
+            row_stride: if num_columns == 0 { 0 } else { row_stride },
+        }
+    }
+
     /// Of `len` elements as rows of `num_columns`.
     #[track_caller]
     pub(super) fn contiguous(len: usize, num_columns: usize) -> Self {
@@ -20,11 +30,7 @@ impl RowShape {
             len,
             "data: expected whole rows of {num_columns} elements"
         );
-        Self {
-            num_rows,
-            num_columns,
-            row_stride: num_columns,
-        }
+        Self::new(num_rows, num_columns, num_columns)
     }
 
     /// Of `len` elements, which must hold all rows.
@@ -40,11 +46,7 @@ impl RowShape {
             end.is_some_and(|end| end <= len),
             "data: expected room for {num_rows} rows of {num_columns} elements, {row_stride} apart, got {len} elements"
         );
-        Self {
-            num_rows,
-            num_columns,
-            row_stride: stride_of(num_columns, row_stride),
-        }
+        Self::new(num_rows, num_columns, row_stride)
     }
 
     /// The elements of row `row`.
@@ -87,11 +89,7 @@ impl RowShape {
     /// A part that begins at `start`, or wherever these rows do if it has no elements.
     #[inline]
     fn part(&self, num_rows: usize, num_columns: usize, start: usize) -> (Self, usize) {
-        let part = Self {
-            num_rows,
-            num_columns,
-            row_stride: stride_of(num_columns, self.row_stride),
-        };
+        let part = Self::new(num_rows, num_columns, self.row_stride);
         (part, if part.is_empty() { 0 } else { start })
     }
 
@@ -99,10 +97,4 @@ impl RowShape {
     fn is_empty(&self) -> bool {
         self.num_rows == 0 || self.num_columns == 0
     }
-}
-
-/// Rows without elements are all at the beginning, wherever that is: no pointer to one is outside the data.
-#[inline]
-fn stride_of(num_columns: usize, row_stride: usize) -> usize {
-    if num_columns == 0 { 0 } else { row_stride }
 }

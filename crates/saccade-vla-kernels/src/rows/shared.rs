@@ -58,4 +58,11 @@ mod tests {
         assert_eq!(data[18..], [18, 19, 200, 200, 200, 23]);
         assert_eq!(data[6..14], [100, 100, 8, 9, 10, 11, 100, 100]);
     }
+
+    #[test]
+    fn rows_of_memory_without_elements_stay_where_they_begin() {
+        // SAFETY: there are no elements.
+        let mut rows = unsafe { RowsMut::<u32>::from_raw(std::ptr::dangling_mut(), 3, 0, 5) };
+        assert_eq!((rows.row_stride(), rows.row_mut(2).len()), (0, 0));
+    }
 }
