@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import shutil
 from collections.abc import Callable
@@ -12,6 +13,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from PIL import Image
 
 import saccade.datasets
 from tests.helpers import dataset_cases as cases
@@ -73,6 +75,22 @@ def rewritten(name: str, column: str, change: Callable[[Any], Any]) -> Change:
 
 def put(place: int, value: Any) -> Callable[[list[Any]], list[Any]]:
     return lambda values: [*values[:place], value, *values[place + 1 :]]
+
+
+def dangling(name: str) -> Change:
+    """A link to nothing, as a cache of downloads has it that was cleared in part."""
+
+    def apply(root: Path) -> None:
+        (root / name).unlink(missing_ok=True)
+        (root / name).symlink_to(root / "nothing")
+
+    return apply
+
+
+def png(mode: str) -> bytes:
+    stream = io.BytesIO()
+    Image.new(mode, cases.SIZE[::-1]).save(stream, "PNG")
+    return stream.getvalue()
 
 
 def shorter_video(root: Path) -> None:
@@ -243,6 +261,13 @@ OPENING: list[tuple[str, Change, str]] = [
     ),
     (
         "v3.0",
+        rewritten("meta/tasks.parquet", "task_index", lambda places: [0, 0]),
+        "tasks.parquet: expected each task_index once, got 0 for 'pick the cube' and 'close the drawer'",
+    ),
+    ("v2.1", dangling("meta/modality.json"), "modality.json: no such file"),
+    ("v3.0", dangling("meta/stats.json"), "stats.json: no such file"),
+    (
+        "v3.0",
         rewritten("meta/episodes/chunk-000/file-000.parquet", "length", put(1, 2)),
         "episode 1: expected 2 steps, its length, got indices 7 to 8",
     ),
@@ -309,6 +334,15 @@ READING: list[tuple[str, Change, str]] = [
         rewritten(OLD_STEPS, "timestamp", lambda times: [time + 0.03 for time in times]),
         "episode 2, step 0, .*: expected a frame at 0.030000 s .* got the nearest at 0.000000 s",
     ),
+    # By a whole step: every frame would be that of another step, in v3.0 some of another episode.
+    *(
+        (
+            layout,
+            rewritten(name, "timestamp", lambda times: [time + 0.1 for time in times]),
+            "episode 2, step 0: timestamp: expected 0 s, the time of the first frame, got 0.100000 s",
+        )
+        for layout, name in (("v2.1", OLD_STEPS), ("v3.0", STEPS))
+    ),
     ("v2.1", rewritten(OLD_STEPS, "timestamp", put(3, float("nan"))), "episode 2, step 3: timestamp"),
     (
         "v2.1",
@@ -356,6 +390,14 @@ READING: list[tuple[str, Change, str]] = [
         "images",
         rewritten(STEPS, "observation.images.front", put(8, {"bytes": b"no picture", "path": None})),
         "episode 2, step 0, observation.images.front: cannot be read as a picture",
+    ),
+    *(
+        (
+            "images",
+            rewritten(STEPS, "observation.images.front", put(8, {"bytes": png(mode), "path": None})),
+            f"episode 2, step 0, observation.images.front: expected a picture in RGB, got {mode}",
+        )
+        for mode in ("RGBA", "L", "I;16")
     ),
     (
         "images",

@@ -189,6 +189,17 @@ def test_the_fingerprint_is_of_every_file(tmp_path: Path) -> None:
     assert len(seen) == 1 + 5 + 3 + 6
 
 
+def test_the_fingerprint_is_of_files_wherever_the_template_leads(tmp_path: Path) -> None:
+    root = cases.write_old(tmp_path / "data")
+    (root / "data").rename(root / "steps")
+    info = root / "meta" / "info.json"
+    info.write_text(info.read_text().replace('"data/chunk', '"steps/chunk'))
+    data = saccade.datasets.open(root)
+    before, path = data.fingerprint(), root / "steps" / "chunk-000" / "episode_000001.parquet"
+    path.write_bytes(path.read_bytes() + b"more")
+    assert data.fingerprint() != before
+
+
 def test_the_keys_and_history_of_a_policy(tmp_path: Path) -> None:
     data = saccade.datasets.open(cases.write_old(tmp_path))
     config = {

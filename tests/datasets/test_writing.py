@@ -128,6 +128,49 @@ def test_an_interrupted_recording_leaves_nothing(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
+def test_an_episode_that_failed_is_not_followed_by_others(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its steps may be written and its frames not: what comes after it would stand at wrong places."""
+
+    def kept() -> None:
+        with saccade.datasets.Writer(tmp_path / "data", **SIZES, extra={"noise_seed": 3}) as writer:
+            writer.add_episode(**episode(0))
+            with monkeypatch.context() as broken:
+                broken.setattr("saccade.datasets.encoding.VideoFile.append", None)
+                with pytest.raises(TypeError):
+                    writer.add_episode(**episode(1))
+            with pytest.raises(saccade.InputError, match="before an episode failed"):
+                writer.add_episode(**episode(1))
+
+    with pytest.raises(saccade.InputError, match="an episode could not be written, nothing is kept"):
+        kept()
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("seed", [(0, 1, 10**15), (0, -1, 0), (0, 1, -1), (0, 1, 3)])
+def test_a_noise_that_cannot_be_is_refused(seed: tuple[int, ...], tmp_path: Path) -> None:
+    """The number of a chunk is at most that of its step; a larger one would be drawn for ever."""
+    extra = {"noise_seed": np.tile(seed, (9, 1)), "chunk_step": np.zeros((9, 1), np.int64)}
+    sizes = {**SIZES, "extra": {"noise_seed": 3, "chunk_step": 1}}
+    with saccade.datasets.Writer(tmp_path / "data", **sizes) as writer:
+        writer.add_episode(**{**episode(0), "extra": extra})
+    data = saccade.datasets.open(tmp_path / "data")
+    with pytest.raises(saccade.DatasetError, match="episode 0, step 2: noise_seed: expected two seeds"):
+        data.noise(0, 2, (1, 4, 2))
+
+
+def test_a_writer_writes_in_its_block_only(tmp_path: Path) -> None:
+    writer = saccade.datasets.Writer(tmp_path / "data", **SIZES, extra={"noise_seed": 3})
+    with pytest.raises(saccade.InputError, match="expected a call in the with block"):
+        writer.add_episode(**episode(0))
+    with writer:
+        writer.add_episode(**episode(0))
+    with pytest.raises(saccade.InputError, match="expected a call in the with block"):
+        writer.add_episode(**episode(0))
+    assert [path.name for path in tmp_path.iterdir()] == ["data"]
+
+
 def test_folders_with_something_in_them_are_left_alone(tmp_path: Path) -> None:
     (tmp_path / "note.txt").write_text("mine")
     with pytest.raises(saccade.InputError, match="path: expected a new or empty folder"):

@@ -266,7 +266,13 @@ class Dataset:
             return None
         if self._stored.column(episode, "chunk_step")[place, 0]:
             return None
-        *seed, draw = self._stored.column(episode, "noise_seed")[place].tolist()
+        given = self._stored.column(episode, "noise_seed")[place].tolist()
+        if len(given) != 3 or not all(type(one) is int and one >= 0 for one in given) or given[-1] > place:
+            raise DatasetError(
+                f"{self._stored.steps(episode).where}, step {place}: noise_seed: expected two seeds and the "
+                f"number of the chunk, at most that of the step, got {given}"
+            )
+        *seed, draw = given
         rng = np.random.default_rng(seed)
         for _ in range(draw):
             rng.standard_normal(shape, dtype=np.float32)
@@ -299,11 +305,18 @@ class Dataset:
 
     def fingerprint(self) -> str:
         """SHA-256 of the names and contents of all files of metadata, steps and videos."""
+        names = {
+            path.relative_to(self.root).as_posix()
+            for folder in ("meta", "data", "videos")
+            for path in self.root.glob(f"{folder}/**/*")
+            if path.is_file()
+        }
+        # A template of paths may lead to other folders, and links to folders are not followed above.
+        for one in self.episodes:
+            names |= {one.file, *(part.file for part in one.videos.values())}
         digest = hashlib.sha256()
-        for folder in ("meta", "data", "videos"):
-            for path in sorted(self.root.glob(f"{folder}/**/*")):
-                if path.is_file():
-                    digest.update(f"{path.relative_to(self.root).as_posix()}\0{sha256_of(path)}\n".encode())
+        for name in sorted(names):
+            digest.update(f"{name}\0{sha256_of(self.root / name)}\n".encode())
         return digest.hexdigest()
 
     def _observation(self, episode: int, step: int, form: str) -> dict[str, Any]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import re
 from collections.abc import Callable, Mapping
 from pathlib import Path, PurePosixPath
@@ -130,15 +131,15 @@ class Info:
                 "missing, or one too many is listed"
             )
         seen: set[int] = set()
-        missing: set[str] = set()
+        there: set[str] = set()
         for episode in episodes:
             if episode.index in seen:
                 raise DatasetError(f"{self.root / 'meta'}: episode {episode.index} is listed twice")
             seen.add(episode.index)
             for file in (episode.file, *(part.file for part in episode.videos.values())):
-                if file not in missing and not (self.root / file).is_file():
-                    missing.add(file)
+                if file not in there and not (self.root / file).is_file():
                     raise DatasetError(f"{self.root / file}: no such file; episode {episode.index} is in it")
+                there.add(file)
 
 
 def _json(path: Path) -> dict[str, Any]:
@@ -210,7 +211,7 @@ def _version_2(info: Info) -> Parts:
 def _by_episode(meta: Path) -> Statistics | None:
     """v2.1: the statistics of episodes, as lerobot combines them."""
     path = meta / "episodes_stats.jsonl"
-    if not path.is_file():
+    if not os.path.lexists(path):  # a link to nothing is damaged, not absent
         return None
     rows = [row.get("stats") for row in _json_lines(path)]
     try:
@@ -223,7 +224,7 @@ def _by_episode(meta: Path) -> Statistics | None:
 def _recorded(meta: Path) -> Statistics | None:
     """``meta/stats.json``."""
     path = meta / "stats.json"
-    if not path.is_file():
+    if not os.path.lexists(path):
         return None
     values = _json(path)
     try:
@@ -242,9 +243,15 @@ def _arrays(values: Any) -> dict[str, dict[str, Any]]:
 def _version_3(info: Info) -> Parts:
     """v3.0: episodes share Parquet files and videos; what is where stands in ``meta/episodes``."""
     meta = info.root / "meta"
-    tasks = {}
-    for text, place in parquet.read_tasks(meta / "tasks.parquet"):
-        tasks[_integer(f"{meta / 'tasks.parquet'}: task_index", place)] = text
+    tasks: dict[int, str] = {}
+    for text, given in parquet.read_tasks(meta / "tasks.parquet"):
+        place = _integer(f"{meta / 'tasks.parquet'}: task_index", given)
+        if place in tasks:
+            raise DatasetError(
+                f"{meta / 'tasks.parquet'}: expected each task_index once, got {place} for {tasks[place]!r} "
+                f"and {text!r}"
+            )
+        tasks[place] = text
     episodes = []
     files = sorted((meta / "episodes").glob("*/*.parquet"))
     if not files:

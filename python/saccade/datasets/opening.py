@@ -56,7 +56,7 @@ def open(
     metadata = read_metadata(root)
     where = root / "meta" / "modality.json"
     given = modality
-    if given is None and where.is_file():
+    if given is None and os.path.lexists(where):  # a link to nothing is damaged, not absent
         given = where
     if given is None:
         keys = plain(metadata.features, str(root / "meta" / "info.json"))

@@ -104,7 +104,11 @@ class Stored:
 
         try:
             with Image.open(io.BytesIO(content)) as picture:
-                return np.asarray(picture.convert("RGB"))
+                if picture.mode != "RGB":  # a conversion would drop transparency, or bits of a depth map
+                    raise DatasetError(f"{where}: expected a picture in RGB, got {picture.mode}")
+                return np.asarray(picture)
+        except DatasetError:
+            raise
         # Pillow raises SyntaxError and others for files that are damaged in their own ways.
         except (OSError, ValueError, SyntaxError, EOFError, Image.DecompressionBombError) as error:
             raise DatasetError(f"{where}: cannot be read as a picture: {error}") from None
@@ -133,6 +137,12 @@ def _check_steps(steps: Steps, about: Episode, fps: float) -> None:
             raise DatasetError(
                 f"{steps.where}, step {step}: timestamp: expected {1 / fps:.6f} s after the step before "
                 f"(within {TOLERANCE} s), got {times[step]:.6f} s after {times[max(step - 1, 0)]:.6f} s"
+            )
+        # Otherwise time and number of a step would name different frames, in v3.0 those of other episodes.
+        if about.videos and abs(times[0]) > 0.5 / fps:
+            raise DatasetError(
+                f"{steps.where}, step 0: timestamp: expected 0 s, the time of the first frame, got "
+                f"{times[0]:.6f} s"
             )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import re
@@ -97,24 +98,33 @@ class Writer:
         self._videos: dict[str, VideoFile] = {}
         self._video_places = dict.fromkeys(cameras, 0)
         self._root = self.path.with_name(f".{self.path.name}.{os.getpid()}")
+        self._is_open = False  # inside the ``with`` block, and every episode is whole
 
     def __enter__(self) -> Writer:
         shutil.rmtree(self._root, ignore_errors=True)
         self._root.mkdir(parents=True)
+        self._is_open = True
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        is_whole, self._is_open = self._is_open, False
         try:
-            if kind is None:
+            with contextlib.ExitStack() as files:
                 for video in self._videos.values():
-                    video.close()
+                    files.callback(video.close)
                 if self._data is not None:
-                    self._data.close()
+                    files.callback(self._data.close)
+            if kind is None:
+                if not is_whole:
+                    raise InputError("add_episode: an episode could not be written, nothing is kept")
                 self._finish()
                 self.path.parent.mkdir(parents=True, exist_ok=True)
                 self._root.replace(self.path)
+        except BaseException:
+            if kind is None:
+                raise  # otherwise what ended the block is raised, not what followed from it
         finally:
             shutil.rmtree(self._root, ignore_errors=True)
 
@@ -137,12 +147,16 @@ class Writer:
             extra: The further columns, ``(steps, width)`` integers.
 
         Raises:
-            InputError, ShapeError: Something is missing, or has another shape or number of steps.
+            InputError, ShapeError: Something is missing, or has another shape or number of steps. Or this is
+                outside the ``with`` block, or an earlier episode could not be written.
         """
+        if not self._is_open:
+            raise InputError("add_episode: expected a call in the with block, before an episode failed")
         columns = {STATE: _rows(STATE, state, np.float32), ACTION: _rows(ACTION, action, np.float32)}
         columns |= {name: _rows(name, values, np.int64) for name, values in (extra or {}).items()}
         length = len(columns[STATE])
         self._check(task, frames, columns, length)
+        self._is_open = False  # until it is written as a whole
         episode = len(self._episodes)
         place = self._tasks.setdefault(task, len(self._tasks))
         steps = np.arange(length)
@@ -172,6 +186,7 @@ class Writer:
         self._statistics = aggregate([self._statistics, found]) if self._statistics else found
         self._frames += length
         self._episodes.append(row)
+        self._is_open = True
 
     def _check(
         self, task: Any, frames: Mapping[str, Any], columns: Mapping[str, npt.NDArray[Any]], length: int
