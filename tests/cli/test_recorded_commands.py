@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ import pytest
 import saccade
 from saccade import cli
 from saccade.cli import recorded
+from saccade.evaluation.source import weights_hash
 from tests.helpers.recorded_cases import Recorded, by_the_policy, demo_policy
 from tests.helpers.recorded_folder import written
 
@@ -101,6 +103,56 @@ def test_a_comparison_with_an_earlier_run(
         run("evaluate", DEMO, folder, "--out", coarse, *options, "--num-steps", 1, "--against", tmp_path) == 2
     )
     assert "expected the directory of an earlier run" in capsys.readouterr().err
+    # The same actions beside other frames are other recordings; and nothing is computed before it is said.
+    other = tmp_path / "other"
+    shutil.copytree(folder, other)
+    (other / "meta" / "note.json").write_text("{}")
+    for recordings, changed, message in (
+        (other, (), "expected the recordings of this run"),
+        (folder, ("--seed", 1), "expected the seed of this run, 1, got 0"),
+        (folder, ("--stride", 8), "expected the stride of this run, 8, got 4"),
+    ):
+        out = tmp_path / "none"
+        assert run("evaluate", DEMO, recordings, "--out", out, *options, *changed, "--against", exact) == 2
+        assert message in capsys.readouterr().err
+        assert not out.exists()
+    (exact / "episodes" / "000001.npz").unlink()
+    assert run("evaluate", DEMO, folder, "--out", coarse, *options, "--num-steps", 1, "--against", exact) == 2
+    assert "expected the episodes of this run, 1 is missing" in capsys.readouterr().err
+
+
+def test_results_are_not_mixed(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out, episodes = tmp_path / "out", tmp_path / "out" / "episodes"
+    tokenizer = tmp_path / "tokenizer.json"
+    shutil.copyfile(Path(DEMO) / "tokenizer.json", tokenizer)
+    options = ("--stride", 16, "--num-threads", 1, "--tokenizer", tokenizer)
+    assert run("evaluate", DEMO, folder, "--out", out, *options) == 0
+    capsys.readouterr()
+    # A file that an option names, with other contents.
+    tokenizer.write_text(tokenizer.read_text() + "\n")
+    assert run("evaluate", DEMO, folder, "--out", out, *options) == 2
+    assert "other settings (option_files changed)" in capsys.readouterr().err
+    options = options[:-2]
+    shutil.rmtree(out)
+    assert run("evaluate", DEMO, folder, "--out", out, *options) == 0
+    # An episode's file under another name.
+    shutil.copyfile(episodes / "000000.npz", episodes / "000001.npz")
+    assert run("evaluate", DEMO, folder, "--out", out, *options) == 2
+    assert "000001.npz: cannot be read: it is of episode 0" in capsys.readouterr().err
+    # Results of which nobody knows the settings.
+    (episodes / "settings.json").unlink()
+    assert run("evaluate", DEMO, folder, "--out", out, *options) == 2
+    assert "settings.json: no such file, but results of episodes beside it" in capsys.readouterr().err
+
+
+def test_the_hash_of_a_checkpoint_tells_where_its_files_are(tmp_path: Path) -> None:
+    for folder, name in (("one", "a"), ("two", "b")):
+        (tmp_path / folder / name).mkdir(parents=True)
+        (tmp_path / folder / name / "merges.txt").write_text("x")
+    first, second = (weights_hash(tmp_path / name) for name in ("one", "two"))
+    assert first != second
+    (tmp_path / "one" / "a" / "merges.txt").write_text("y")
+    assert weights_hash(tmp_path / "one") != first
 
 
 def test_a_certificate_holds_here_and_notices_changes(
@@ -139,7 +191,20 @@ def test_a_certificate_holds_here_and_notices_changes(
     file.write_text(json.dumps(wrong))
     assert run("certify", file) == 1
     capsys.readouterr()
-    for wrong in ({"sampling": {"speed": 2}}, {"observations": [[0]]}, {"stride": 1.5}, {"checkpoint": {}}):
+    for wrong in (
+        {"sampling": {"speed": 2}},
+        {"observations": [[0]]},
+        {"observations": []},
+        {"observations": [[0, 0]] * 17},
+        {"observations": [[0, -1]]},
+        {"seed": -1},
+        {"stride": 1.5},
+        {"checkpoint": {}},
+        {"equal_over_batches": "yes"},
+        {"from_float32": {"normalized": 1e999}},
+        {"from_float32": {"normalized": -1}},
+        {"from_float32": {"normalized": None}},
+    ):
         file.write_text(json.dumps({**values, **wrong}))
         assert run("certify", file) == 2
     other = {**values, "recordings": {**values["recordings"], "sha256": "0" * 64}}

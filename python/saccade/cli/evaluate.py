@@ -11,10 +11,12 @@ from saccade._internal import flags as arguments
 from saccade._internal.files import write_atomically, write_json
 from saccade.cli import EXIT_OK, output, recorded, require
 from saccade.cli.output import Section, show
+from saccade.errors import InputError
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
+    from saccade.evaluation.prediction import Predicted
     from saccade.evaluation.report import Comparison, Evaluation
 
 HELP = "compare a checkpoint's actions with recorded ones"
@@ -75,19 +77,14 @@ def run(args: argparse.Namespace) -> int:
         identity = source.identity()
     sampling = {} if args.num_steps is None else {"num_steps": args.num_steps}
     settings = {"command": "evaluate", **identity, "stride": stride, "seed": args.seed, "sampling": sampling}
+    before = None if args.against is None else earlier(args.against, settings, episodes)
     files = EpisodeFiles(args.out, Predicted)
     files.begin(settings)
     layout = Layout.of(policy.normalizer)
     work = PredictEpisode(source, stride, args.seed, sampling)
     predictions = recorded.computed(work, episodes, files, args, source, "evaluate")
     report = summarised(predictions, layout, stride, args.seed)
-    comparison = None
-    if args.against is not None:
-        earlier = EpisodeFiles(args.against, Predicted)
-        about = earlier.settings()
-        found = [one for episode in earlier.places() if (one := earlier.load(episode)) is not None]
-        kept = [one for one in found if one.episode in episodes]
-        comparison = report.compare(summarised(kept or found, layout, about["stride"], about["seed"]))
+    comparison = None if before is None else report.compare(summarised(before, layout, stride, args.seed))
     written = {
         **settings,
         **report.to_json(),
@@ -106,6 +103,35 @@ def run(args: argparse.Namespace) -> int:
     if drawn:
         print(f"page     {args.out / 'index.html'}")
     return EXIT_OK
+
+
+def earlier(folder: Path, settings: Mapping[str, Any], episodes: Sequence[int]) -> list[Predicted]:
+    """The predictions of an earlier run, checked before anything is computed.
+
+    Raises:
+        FileNotFoundError: There are no results.
+        InputError: They are of other recordings, stride or seed, or an episode is missing.
+    """
+    from saccade.evaluation.episode_files import EpisodeFiles
+    from saccade.evaluation.prediction import Predicted
+
+    files = EpisodeFiles(folder, Predicted)
+    about = files.settings()
+    for name in ("command", "recordings", "stride", "seed"):
+        one, other = (
+            given.get("sha256") if isinstance(given, dict) else given
+            for given in (about.get(name), settings[name])
+        )
+        if one != other:
+            raise InputError(f"--against: {folder}: expected the {name} of this run, {other}, got {one}")
+    found = [(episode, files.load(episode)) for episode in episodes]
+    missing = [str(episode) for episode, one in found if one is None]
+    if missing:
+        raise InputError(
+            f"--against: {folder}: expected the episodes of this run, {', '.join(missing)} "
+            f"{'is' if len(missing) == 1 else 'are'} missing"
+        )
+    return [one for _, one in found if one is not None]
 
 
 def write_table(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:

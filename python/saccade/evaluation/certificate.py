@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import hashlib
 import json
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -104,6 +105,8 @@ class Certificate:
             if not all(isinstance(part[name], str) for name in ("name", "path", "sha256")):
                 raise TypeError("checkpoint, recordings: expected texts")
         base64.b64decode(self.actions, validate=True)
+        if type(self.equal_over_batches) is not bool or type(self.equal_over_threads) is not bool:
+            raise TypeError("equal_over_batches, equal_over_threads: expected true or false")
         for name, given, known in (("options", self.options, OPTIONS), ("sampling", self.sampling, SAMPLING)):
             if any(key not in known for key in dict(given)):
                 raise ValueError(f"{name}: expected {', '.join(known)}, got {given!r:.100}")
@@ -112,7 +115,11 @@ class Certificate:
             len(place) != 2 for place in self.observations
         ):
             raise TypeError("stride, seed, observations: expected integers")
-        float(self.from_float32["normalized"])
+        if min(numbers, default=0) < 0 or not 1 <= len(self.observations) <= MOST:
+            raise ValueError(f"seed, observations: expected 1 to {MOST} observations, and no negative number")
+        # What another machine may differ by follows from it.
+        if not 0 <= float(self.from_float32["normalized"]) < math.inf:
+            raise ValueError("from_float32: normalized: expected a finite number of at least 0")
         dict(self.made_with)
 
 

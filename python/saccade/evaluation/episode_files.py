@@ -36,7 +36,7 @@ class EpisodeFiles(Generic[Record]):
         """Writes the settings of a run, or checks that the directory has results of the same settings.
 
         Raises:
-            InputError: It has results of others; lists the settings that differ.
+            InputError: It has results of others, or without settings; lists the settings that differ.
             OSError: It cannot be written.
         """
         now = json.loads(dumps(settings))
@@ -50,6 +50,8 @@ class EpisodeFiles(Generic[Record]):
                     "choose another directory, or delete this one"
                 )
             return
+        if self.places():
+            raise InputError(f"{file}: no such file, but results of episodes beside it: delete {self.folder}")
         self.folder.mkdir(parents=True, exist_ok=True)
         write_json(file, now)
 
@@ -93,9 +95,12 @@ class EpisodeFiles(Generic[Record]):
         try:
             with np.load(path, allow_pickle=False) as arrays:
                 values = {name: arrays[name] for name in arrays.files}
-            return self.kind(
+            found = self.kind(
                 **{name: value.item() if not value.ndim else value for name, value in values.items()}
             )
+            if found.episode != episode:  # type: ignore[attr-defined]
+                raise ValueError(f"it is of episode {found.episode}")  # type: ignore[attr-defined]
+            return found
         except (OSError, ValueError, TypeError, EOFError, zipfile.BadZipFile) as error:
             raise InputError(f"{path}: cannot be read: {error}; delete it to compute it again") from None
 

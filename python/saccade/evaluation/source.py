@@ -18,7 +18,9 @@ from saccade.datasets import open as open_recordings
 from saccade.policy.policy import Policy
 
 #: Files of a checkpoint that decide what it computes.
-WEIGHTS, COMPANIONS = ("*.safetensors",), ("*.json", "*.txt", "*/*.json", "*/*.safetensors")
+WEIGHTS, COMPANIONS = ("*.safetensors",), ("*.json", "*.txt", "*/*.json", "*/*.txt", "*/*.safetensors")
+#: Options that may be paths of files, which can change while their names stay.
+FILES = ("tokenizer", "data_config")
 
 
 @dataclass(frozen=True)
@@ -69,6 +71,11 @@ class Source:
                 "sha256": _data(self.recordings).fingerprint(),
             },
             "options": {name: value for name, value in self.options.items() if name != "num_threads"},
+            "option_files": {
+                name: weights_hash(path)
+                for name in FILES
+                if isinstance(path := self.options.get(name), str) and Path(path).exists()
+            },
             "saccade": config["saccade"],
             "instruction_set": config["isa"],
         }
@@ -87,7 +94,7 @@ def _data(recordings: str) -> Dataset:
 def weights_hash(checkpoint: str | Path) -> str:
     """SHA-256 of the weights of a checkpoint, and of the files that decide how they are used.
 
-    The digest is that of lines with name and hash of each file.
+    The digest is that of lines with name, relative to the directory, and hash of each file.
     """
     folder = Path(checkpoint)
     files = (
@@ -97,5 +104,6 @@ def weights_hash(checkpoint: str | Path) -> str:
         if folder.is_dir()
         else [folder]
     )
-    lines = "".join(f"{path.relative_to(folder.parent).name} {sha256_of(path)}\n" for path in files)
+    names = [path.name if path == folder else path.relative_to(folder).as_posix() for path in files]
+    lines = "".join(f"{name} {sha256_of(path)}\n" for name, path in zip(names, files, strict=True))
     return hashlib.sha256(lines.encode()).hexdigest()
