@@ -125,7 +125,7 @@ def test_results_are_not_mixed(folder: Path, tmp_path: Path, capsys: pytest.Capt
     out, episodes = tmp_path / "out", tmp_path / "out" / "episodes"
     tokenizer = tmp_path / "tokenizer.json"
     shutil.copyfile(Path(DEMO) / "tokenizer.json", tokenizer)
-    options = ("--stride", 16, "--num-threads", 1, "--tokenizer", tokenizer)
+    options: tuple[Any, ...] = ("--stride", 16, "--num-threads", 1, "--tokenizer", tokenizer)
     assert run("evaluate", DEMO, folder, "--out", out, *options) == 0
     capsys.readouterr()
     # A file that an option names, with other contents.

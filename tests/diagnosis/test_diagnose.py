@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -17,7 +18,7 @@ from saccade.diagnosis.effects import measure_episode
 from saccade.diagnosis.plan import default_episodes, partners_of, planned, steps_of
 from saccade.observations import ParsedObservation, read
 from saccade_lab.random_checkpoint.whole import small_backbone, small_head, write
-from tests.helpers.recorded_cases import Recorded, demo_policy, made_up
+from tests.helpers.recorded_cases import Recorded, demo_policy, made_up, still
 
 LENGTHS = (9, 5, 8, 1, 12)
 
@@ -79,6 +80,18 @@ def test_what_would_change_nothing_is_left_out(data: Recorded) -> None:
         "instruction: shuffled",
         *(f"camera.{camera}: blanked" for camera in ("left", "right", "top")),
     ]
+
+
+def test_an_input_that_is_always_the_same_is_undecided_and_not_left_out() -> None:
+    """A black camera and a state that stands still: the recordings cannot show whether they are used."""
+    data = still((1, 1, 1, 1, 1))
+    report = saccade.diagnose(demo_policy(), data)
+    assert set(report.inputs) == {"instruction", "camera.left", "camera.right", "camera.top", "state"}
+    for name in ("camera.top", "state"):
+        verdict = report.inputs[name]
+        assert (verdict.name, dict(verdict.changes)) == ("undecided", {})
+        assert math.isnan(verdict.effect)
+    assert report.to_json()["inputs"]["state"]["name"] == "undecided"
 
 
 def test_a_history_is_replaced_by_the_newest() -> None:

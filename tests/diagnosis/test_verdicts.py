@@ -64,6 +64,8 @@ def test_few_episodes_and_a_deaf_policy_come_first() -> None:
     assert decided(used, effect(None, 1, 1, episodes=4)) == "undecided"
     assert decided(used, None) == "undecided"
     assert decided(used, effect(None, 1, 1, of_noise=0.009)) == "ignored"
+    assert decided({}, effect(None, 1, 1, of_noise=0.009)) == "ignored"
+    assert decided({}, SEEN) == "undecided"
     assert decided(used, effect(None, 1, 1, of_noise=0.011)) == "used"
 
 

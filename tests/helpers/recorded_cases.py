@@ -86,6 +86,16 @@ def made_up(
     return Recorded(seen, done)
 
 
+def still(lengths: Sequence[int]) -> Recorded:
+    """As :func:`made_up`, with a black camera, and a state that is the same everywhere."""
+    data = made_up(lengths)
+    state = data.seen[0][0]["state"]
+    for observation in (one for episode in data.seen for one in episode):
+        observation["video"]["top"] = np.zeros_like(observation["video"]["top"])
+        observation["state"].update(state)
+    return data
+
+
 def by_the_policy(policy: Policy, lengths: Sequence[int], stride: int, seed: int) -> Recorded:
     """Observations of :func:`made_up`, with the actions that the policy predicts as ``evaluate`` does."""
     data = made_up(lengths, policy=policy)

@@ -32,6 +32,7 @@ ADVICE = {
     "it does no harm and helps on a robot with other sensors.",
     "history": "The newest frame and state tell what the policy needs; one step is faster.",
 }
+SAME = "It is the same in all of these recordings, so they cannot show whether the policy uses it."
 UNDECIDED = "Record more episodes, or pass more with --episodes: the interval contains a limit."
 STATE = (
     "The state may leak the action: a policy that repeats what the arm does anyway looks good in open loop "
@@ -99,6 +100,8 @@ def diagnosis_page(
 
 
 def _advice(name: str, verdict: Verdict) -> str:
+    if not verdict.changes:
+        return SAME
     if verdict.name == "undecided":
         return UNDECIDED
     kind = name.partition(".")[0]
@@ -108,8 +111,10 @@ def _advice(name: str, verdict: Verdict) -> str:
     return "" if verdict.name == "used" else ADVICE[kind]
 
 
-def _most(verdict: Verdict) -> tuple[str, int, int]:
-    """The main change, or the largest, and where it is largest."""
+def _most(verdict: Verdict) -> tuple[str, int, int] | None:
+    """The main change, or the largest, and where it is largest; None if no change is possible."""
+    if not verdict.changes:
+        return None
     main = [name for name, one in verdict.changes.items() if one.kind == "main"]
     largest = max(verdict.changes, key=lambda name: verdict.changes[name].share.value)
     name = main[0] if main else largest
@@ -120,9 +125,10 @@ def _texts(
     name: str, verdict: Verdict, policy: Policy, data: Recordings, report: Diagnosis
 ) -> tuple[str, str | None] | None:
     """The instruction at which it matters most, and what replaced it."""
-    if name != "instruction":
+    most = _most(verdict)
+    if name != "instruction" or most is None:
         return None
-    _, episode, step = _most(verdict)
+    _, episode, step = most
     (text,) = observation_at(policy, data, episode, step).instructions
     return None if text is None else (text, replacement(text, report.plan.instructions))
 
@@ -131,7 +137,10 @@ def _frames(
     name: str, verdict: Verdict, policy: Policy, data: Recordings, report: Diagnosis
 ) -> list[dict[str, str]]:
     """The frames at which the change matters most; for a camera only its own, and the partner's."""
-    change, episode, step = _most(verdict)
+    most = _most(verdict)
+    if most is None:
+        return []
+    change, episode, step = most
     seen = observation_at(policy, data, episode, step)
     (frames,) = seen.frames
     views = list(frames)

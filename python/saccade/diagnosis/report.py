@@ -63,9 +63,11 @@ def summarised(measured: Sequence[Measured], plan: Plan, keys: Sequence[str]) ->
     by_input: dict[str, dict[str, Effect]] = {}
     for name in dict.fromkeys(name for one in measured for name in one.names.tolist()):
         changed, change, kind = name.rsplit("|", 2)
-        found = effect(name, kind) if changed else None
-        if found is not None:
-            by_input.setdefault(changed, {})[change] = found
+        if not changed:
+            continue
+        changes = by_input.setdefault(changed, {})  # an input that no change is possible of is listed too
+        if (found := effect(name, kind)) is not None:
+            changes[change] = found
     return Diagnosis(
         inputs={name: verdict_of(changes, observation) for name, changes in by_input.items()},
         observation=observation,

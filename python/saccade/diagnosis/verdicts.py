@@ -49,7 +49,7 @@ class Verdict:
     Attributes:
         name: ``"used"``, ``"barely used"``, ``"ignored"`` or ``"undecided"``.
         effect: Effect of the main change as a share of what another observation changes; without a main
-            change, the largest of the others.
+            change, the largest of the others; NaN if no change is possible.
         low, high: Its 95 % interval.
         changes: All changes of the input, by name.
     """
@@ -109,10 +109,12 @@ def decided(changes: Mapping[str, Effect], observation: Effect | None) -> Verdic
         observation: The effect of another observation.
     """
     possible = {name: one for name, one in changes.items() if one.episodes >= FEWEST_EPISODES}
-    if observation is None or observation.episodes < FEWEST_EPISODES or not possible:
+    if observation is None or observation.episodes < FEWEST_EPISODES:
         return "undecided"
     if observation.of_noise.high < DEAF:
         return "ignored"
+    if not possible:
+        return "undecided"
     main = [one.share for one in possible.values() if one.kind == "main"]
     if not main:
         return "ignored" if all(one.share.high < IGNORED for one in possible.values()) else "undecided"
@@ -129,5 +131,7 @@ def decided(changes: Mapping[str, Effect], observation: Effect | None) -> Verdic
 def verdict_of(changes: Mapping[str, Effect], observation: Effect | None) -> Verdict:
     """The verdict on an input, and the effect that it rests on."""
     main = [one for one in changes.values() if one.kind == "main"]
-    shown = (main or sorted(changes.values(), key=lambda one: one.share.value, reverse=True))[0].share
+    others = sorted(changes.values(), key=lambda one: one.share.value, reverse=True)
+    nothing = Estimate(math.nan, math.nan, math.nan)
+    shown = next((one.share for one in (*main, *others)), nothing)
     return Verdict(decided(changes, observation), shown.value, shown.low, shown.high, dict(changes))

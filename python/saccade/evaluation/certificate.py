@@ -105,7 +105,8 @@ class Certificate:
             if not all(isinstance(part[name], str) for name in ("name", "path", "sha256")):
                 raise TypeError("checkpoint, recordings: expected texts")
         base64.b64decode(self.actions, validate=True)
-        if type(self.equal_over_batches) is not bool or type(self.equal_over_threads) is not bool:
+        equal: list[Any] = [self.equal_over_batches, self.equal_over_threads]
+        if any(type(one) is not bool for one in equal):
             raise TypeError("equal_over_batches, equal_over_threads: expected true or false")
         for name, given, known in (("options", self.options, OPTIONS), ("sampling", self.sampling, SAMPLING)):
             if any(key not in known for key in dict(given)):

@@ -16,7 +16,7 @@ from selenium.webdriver.chrome.service import Service
 import saccade
 from saccade.evaluation import Evaluation
 from saccade_lab.recordings import pages
-from tests.helpers.recorded_cases import Recorded, demo_policy, made_up
+from tests.helpers.recorded_cases import Recorded, demo_policy, made_up, still
 
 BROWSER, DRIVER = shutil.which("chromium"), shutil.which("chromedriver")
 needs_browser = pytest.mark.skipif(
@@ -52,6 +52,13 @@ def written(data: Recorded, report: Evaluation, tmp_path_factory: pytest.TempPat
         saccade.diagnose(demo_policy(), short), ABOUT, demo_policy(), short, found["diagnosis"]
     )
     return found
+
+
+def test_an_input_without_a_change_is_on_the_page(tmp_path: Path) -> None:
+    data = still((1, 1, 1, 1, 1))
+    pages.diagnosis_page(saccade.diagnose(demo_policy(), data), ABOUT, demo_policy(), data, tmp_path)
+    text = (tmp_path / "index.html").read_text(encoding="utf-8")
+    assert text.count(pages.SAME) == 2  # the state, and the camera that is black
 
 
 @pytest.mark.parametrize("name", ["evaluation", "diagnosis"])
