@@ -76,7 +76,7 @@ def test_only_numpy_is_required_and_extras_are_named() -> None:
     metadata = importlib.metadata.metadata("saccade-vla")
     required = [line for line in metadata.get_all("Requires-Dist") or [] if "extra ==" not in line]
     assert required == ["numpy>=1.24"]
-    assert set(metadata.get_all("Provides-Extra") or []) == {"cli", "serve", "torch", "hub"}
+    assert set(metadata.get_all("Provides-Extra") or []) == {"cli", "data", "hub", "serve", "torch"}
 
 
 @pytest.fixture
