@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -47,3 +48,27 @@ def test_random_sizes(version: str, seed: int, isa: str) -> None:
         error = np.square(features.backbone_features - expected).mean() / np.square(expected).mean()
         assert error < tolerance**2, (precision, isa)
         np.testing.assert_array_equal(features.image_mask, inputs.input_ids == sizes.image_token)
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("version", RELEASED)
+def test_holes_in_the_mask(version: str, seed: int, isa: str) -> None:
+    """Rows that are not attended to may stand between others: those after them pass them over."""
+    rng = np.random.default_rng(seed)
+    sizes = random_sizes(version, rng)
+    reference = randomised(Backbone(sizes), seed)
+    inputs = random_inputs(sizes, rng, batch=2, views=1)
+    words = rng.integers(30, size=(2, 12))
+    ids = np.hstack([inputs.input_ids, words])
+    mask = np.hstack([np.asarray(inputs.attention_mask, bool), rng.random(words.shape) < 0.5])
+    mask[:, -3:] = [True, False, True]
+    pixels: Any = np.asarray(inputs.pixel_values)
+    if version == "n1.6":
+        pixels = tuple(np.split(pixels, len(pixels)))
+    given = saccade.BackboneInputs(pixels, ids, mask, inputs.image_grid_thw)
+    with torch.no_grad():
+        expected = reference.double()(given).backbone_features.numpy()
+    tensors = dict(reference.float().state_dict())
+    backbone = saccade.Backbone.from_tensors(tensors, config=config_of(sizes))
+    difference = np.square(backbone(given).backbone_features - expected)
+    assert difference.mean() / np.square(expected).mean() < TOLERANCE["float32"] ** 2, isa
