@@ -52,7 +52,7 @@ fn what_does_not_fit_is_named() {
     let [head, other] = [(); 2].map(|()| released(HEADS[0], 1));
     let (with, without) = (Inputs::new(&head, &[0, 1], 9), Inputs::new(&head, &[0, 1], 6));
     let argument = |error: Error| error.argument().map(str::to_owned);
-    for weight in [-1.0, f64::NAN, f64::INFINITY, 1e39] {
+    for weight in [-1.0, -1e-60, f64::NAN, f64::INFINITY, 1e39] {
         let error = with.sample(&guided(&without.context, weight)).unwrap_err();
         assert_eq!(argument(error).as_deref(), Some("guidance"), "{weight}");
     }

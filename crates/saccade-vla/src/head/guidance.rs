@@ -36,7 +36,8 @@ pub struct Guidance<'a> {
     /// Encoded by the same head, with as many observations as the first context. The numbers of
     /// vision-language tokens may differ.
     pub without: &'a Context,
-    /// At least 0. 1 samples the first context alone, and costs nothing; 0 has the result of the second.
+    /// At least 0, rounded to float32. 1 samples the first context alone, and costs nothing; 0 has the result of
+    /// the second.
     pub weight: f64,
 }
 
@@ -73,7 +74,8 @@ impl ActionHead {
             return Ok(None);
         };
         let rounded = weight as f32;
-        if !(rounded.is_finite() && rounded >= 0.0) {
+        // Of the number that was given: a small one below 0 is rounded to -0, which is at least 0.
+        if !(rounded.is_finite() && weight >= 0.0) {
             return Err(Error::Input(problem!(
                 "guidance"; expected "a finite number of at least 0"; got "{weight}"
             )));
