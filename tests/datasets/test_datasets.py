@@ -237,6 +237,13 @@ def test_the_keys_and_history_of_a_policy(tmp_path: Path) -> None:
         saccade.InputError, match="data_config: expected one, because the checkpoint does not say"
     ):
         data.for_policy(policy_like(dataclasses.replace(needs, video_indices=None), ["arm"]))
+    # The data config that the data set was opened with says it.
+    told = expected.for_policy(policy_like(dataclasses.replace(needs, video_indices=None), ["arm"]))
+    assert np.array_equal(told.observation(2, 5)["video"]["wrist"], wanted["video"]["wrist"])
+    other = dataclasses.replace(needs, language_keys=("annotation.human.other",))
+    assert expected.for_policy(policy_like(other, ["arm"])).language_key == needs.language_keys[0]
+    with pytest.raises(saccade.InputError, match="has several"):
+        _ = data.for_policy(policy_like(other, ["arm"])).language_key
     with pytest.raises(
         saccade.InputError, match=r"policy: state.leg, action.leg: not in .*modality.json, which has"
     ):

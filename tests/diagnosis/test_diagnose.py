@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import math
 from collections.abc import Sequence
 from pathlib import Path
@@ -242,12 +243,28 @@ def test_one_episode_has_no_partner(data: Recorded) -> None:
         saccade.diagnose(demo_policy(), data, seed=-1)
 
 
+@pytest.mark.parametrize("indices", [list(range(1, 17)), list(range(0, 32, 2))])
+def test_chunks_that_leave_steps_out_are_refused(indices: list[int], tmp_path: Path) -> None:
+    """They would be compared with actions of other steps."""
+    folder = tmp_path / "small"
+    write(folder, "n1.6", backbone=small_backbone("n1.6"), head=small_head("n1.6"), seed=1)
+    file = folder / "processor_config.json"
+    values = json.loads(file.read_text())
+    for robot in values["processor_kwargs"]["modality_configs"].values():
+        robot["action"]["delta_indices"] = indices
+    file.write_text(json.dumps(values))
+    policy = Policy.from_pretrained(folder, num_threads=1)
+    with pytest.raises(InputError, match="policy: expected action_indices 0, 1, 2"):
+        saccade.evaluate(policy, made_up((2,), policy=policy))
+
+
 @pytest.mark.parametrize("version", ["n1.6", "n1.7"])
 def test_other_releases_are_evaluated_and_diagnosed(version: str, tmp_path: Path) -> None:
     """Heads without future tokens, whose blocks see text or images, and that denoise more than they give."""
     write(tmp_path / "small", version, backbone=small_backbone(version), head=small_head(version), seed=1)
     policy = Policy.from_pretrained(tmp_path / "small", num_threads=1)
     data = made_up((2, 1), policy=policy)
+    assert policy.requirements.action_indices == tuple(range(16))
     report = saccade.evaluate(policy, data)
     assert report.horizon == 16 < policy.head.config.action_horizon
     found = saccade.diagnose(policy, data)

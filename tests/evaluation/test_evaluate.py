@@ -240,6 +240,8 @@ def test_one_key_of_the_whole_width_is_the_action(data: Recorded, report: Evalua
     whole = [np.concatenate(parts, -1) for parts in zip(*data.done.values(), strict=True)]
     found = saccade.evaluate(demo_policy(), Recorded(data.seen, {"action": whole}), stride=4)
     assert found.mse == report.mse
+    with pytest.raises(InputError, match=r"expected the keys of the policy, .*, got other"):
+        saccade.evaluate(demo_policy(), Recorded(data.seen, {"other": whole}), stride=4)
 
 
 class InLerobotsForm(Recorded):

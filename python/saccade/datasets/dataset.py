@@ -116,7 +116,7 @@ class Dataset:
         keys = self._modality
         if policy.normalizer.pipeline is not None:
             keys = plain(self._metadata.features, keys.where)
-        return Dataset(self._stored, keys, selection_of(policy, keys))
+        return Dataset(self._stored, keys, selection_of(policy, keys, self._selection))
 
     def observation(self, episode: int, step: int, form: str = "isaac") -> dict[str, Any]:
         """The observation at a step, as :meth:`saccade.Policy.act` takes it, with a batch axis of one.

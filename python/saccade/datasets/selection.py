@@ -109,8 +109,14 @@ def _from_configs(given: Mapping[str, Any]) -> Selection:
     return Selection(parts["video"], parts["state"], parts["action"], next(iter(language.keys), None))
 
 
-def selection_of(policy: ObservingPolicy, modality: Modality) -> Selection:
+def selection_of(policy: ObservingPolicy, modality: Modality, opened: Selection) -> Selection:
     """The keys and steps of a policy.
+
+    Args:
+        policy: The policy.
+        modality: The keys of the data set.
+        opened: What the data set was opened with; it says what the checkpoint does not: at which steps a
+            history is, and which of several instructions counts.
 
     Raises:
         InputError: The data set has not the policy's keys, or the checkpoint does not say at which steps its
@@ -129,10 +135,10 @@ def selection_of(policy: ObservingPolicy, modality: Modality) -> Selection:
     if len(needs.language_keys) > 1:
         raise InputError(f"policy: expected one language key, got {', '.join(needs.language_keys)}")
     if needs.any_annotation and language not in modality.language:
-        language = None
+        language = opened.language if opened.language in modality.language else None
     found = Selection(
-        Part(cameras, _steps("frames", needs.video_indices, needs.video_horizon)),
-        Part(states, _steps("states", needs.state_indices, needs.state_history)),
+        Part(cameras, _steps("frames", needs.video_indices, needs.video_horizon, opened.video)),
+        Part(states, _steps("states", needs.state_indices, needs.state_history, opened.state)),
         Part(actions, needs.action_indices),
         language,
     )
@@ -147,11 +153,13 @@ def _camera(camera: Camera, modality: Modality) -> str:
     return camera.name
 
 
-def _steps(what: str, indices: tuple[int, ...] | None, count: int | None) -> tuple[int, ...]:
-    """The steps of a history, which are known if there is none."""
+def _steps(what: str, indices: tuple[int, ...] | None, count: int | None, opened: Part) -> tuple[int, ...]:
+    """The steps of a history, which are known if there is none, or from a data config of that length."""
     if indices is not None:
         return indices
     if count not in (None, 1):
+        if opened.indices is not None and len(opened.indices) == count:
+            return opened.indices
         raise InputError(
             f"data_config: expected one, because the checkpoint does not say at which steps the "
             f"{count} {what} of an observation are"

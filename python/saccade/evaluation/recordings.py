@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from saccade._internal.arrays import integer
+from saccade.datasets.modality import ACTION
 from saccade.errors import InputError, SaccadeError, ShapeError
 from saccade.observations import ParsedObservation, read
 
@@ -105,7 +106,7 @@ def actions_of(policy: Policy, data: Recordings, episode: int, horizon: int) -> 
     """All recorded actions of an episode, ``(steps, action_width)`` in the policy's order of keys.
 
     They are read in pieces of ``horizon``, since a data set may have no more at once. float64 if they were
-    recorded so, else float32. A recording with one key of the whole width fits any policy of that width.
+    recorded so, else float32. A recording with the one key ``action`` fits any policy of its width.
 
     Raises:
         InputError, ShapeError: A key is missing, has another width, or is not finite.
@@ -130,10 +131,8 @@ def _joined(
     groups = policy.normalizer.action_groups
     names, width = [group.key for group in groups], policy.normalizer.action_width
     where = f"{where}: actions"
-    if len(given) == 1 and names != list(given):
-        (only,) = given.values()
-        if np.shape(only)[-1:] == (width,):
-            return _checked(where, only, length, width)
+    if list(given) == [ACTION] and names != [ACTION] and np.shape(given[ACTION])[-1:] == (width,):
+        return _checked(where, given[ACTION], length, width)
     missing = [name for name in names if name not in given]
     if missing:
         raise InputError(

@@ -12,7 +12,7 @@ from saccade.errors import CheckpointError
 from saccade.observations.lerobot import IMAGE, IMAGES
 from saccade.observations.requirements import Camera, Requirements
 from saccade.robots import Robot
-from saccade.robots.building import size_of
+from saccade.robots.building import size_of, value_at
 from saccade.robots.lerobot_pipeline import PREPROCESSOR, read_pipeline
 from saccade.robots.reading import processor_folder, processor_version
 
@@ -77,6 +77,7 @@ def _lerobot(folder: Path, values: Mapping[str, Any], robot: Robot) -> Requireme
         language_keys=(pack.get("language_key") or "task",),
         takes_extra_cameras=not ordered,
         rename_map=tuple(pipeline.rename_map.items()),
+        action_indices=_steps(value_at(pipeline.unpack.config, "modality_config", "action")),
     )
 
 
@@ -116,6 +117,7 @@ def _processor(folder: Path, values: Mapping[str, Any], robot: Robot) -> Require
         video_horizon=len(steps) or None,
         video_indices=_steps(about.get("video")),
         state_indices=_steps(about.get("state")),
+        action_indices=_steps(about.get("action")),
         language_keys=tuple(keys),
         requires_language=True,
     )
