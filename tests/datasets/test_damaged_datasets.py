@@ -110,6 +110,18 @@ def shifted_video(root: Path) -> None:
         container.mux(stream.encode())
 
 
+def damaged_video(root: Path) -> None:
+    """Some bytes within the second group of frames, of steps 5 to 9, are others."""
+    import av
+
+    with av.open(str(root / OLD_VIDEO)) as container:
+        packets = [packet for packet in container.demux(video=0) if packet.size]
+    place = (packets[5].pos or 0) + packets[5].size // 2
+    content = bytearray((root / OLD_VIDEO).read_bytes())
+    content[place : place + 64] = b"\xff" * 64
+    (root / OLD_VIDEO).write_bytes(content)
+
+
 def small_video(root: Path) -> None:
     """The frames have another size than info.json says."""
     import av
@@ -318,6 +330,11 @@ READING: list[tuple[str, Change, str]] = [
         "v2.1",
         shifted_video,
         f"episode 2, step 1, .*{OLD_VIDEO}: expected a frame at 0.100000 s .* got the nearest",
+    ),
+    (
+        "v2.1",
+        damaged_video,
+        f"episode 2, step [5-9], .*{OLD_VIDEO} cannot be decoded: .*damaged",
     ),
     (
         "v2.1",

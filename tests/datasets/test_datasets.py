@@ -16,6 +16,7 @@ import pytest
 
 import saccade.datasets
 import saccade.observations
+from saccade.datasets.videos import Videos
 from tests.helpers import dataset_cases as cases
 from tests.helpers.paths import DATA
 
@@ -76,6 +77,45 @@ def test_every_frame_in_any_order_is_that_of_the_whole_video(root: Path) -> None
                 found = data.frame(episode, int(step), name)
                 np.testing.assert_array_equal(found.pixels, expected[step])
                 assert found.timestamp == pytest.approx(step / cases.FPS, abs=1e-6)
+
+
+def test_a_frame_is_the_callers(root: Path) -> None:
+    """A camera's picture that is drawn on stays as it was recorded."""
+    data = saccade.datasets.open(root)
+    frame = data.frame(2, 3, "front")
+    before = frame.pixels.copy()
+    frame.pixels[:] = 0
+    np.testing.assert_array_equal(data.frame(2, 3, "front").pixels, before)
+
+
+@pytest.mark.parametrize(
+    ("codec", "options"),
+    [
+        ("libx265", {"g": "8", "x265-params": "log-level=none"}),  # open groups of pictures
+        ("libx264", {"g": "8", "x264-params": "open-gop=1"}),
+        ("libsvtav1", {"g": "2", "crf": "30"}),  # as lerobot encodes
+        ("mpeg4", {}),
+    ],
+)
+def test_every_frame_of_other_encodings(codec: str, options: dict[str, str], tmp_path: Path) -> None:
+    """Frames that stand before a keyframe are stored after it where groups are open."""
+    import av
+
+    if codec not in av.codecs_available:
+        pytest.skip(f"PyAV has no {codec}")
+    path = tmp_path / "video.mp4"
+    with av.open(str(path), "w") as container:
+        stream: Any = container.add_stream(codec, rate=cases.FPS, options=options)
+        stream.height, stream.width, stream.pix_fmt = 96, 128, "yuv420p"
+        for pixels in cases.pixels(1, 40, 0):
+            frame = av.VideoFrame.from_ndarray(pixels.repeat(2, axis=0).repeat(2, axis=1), "rgb24")
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+    whole, videos = cases.decoded(path), Videos()
+    assert len(whole) == 40
+    for place in (*np.random.default_rng(0).permutation(40).tolist(), *range(40)):
+        found = videos.frame("here", path, place / cases.FPS, 0.0)
+        np.testing.assert_array_equal(found.pixels, whole[place][1])
 
 
 def test_observations_of_a_history(root: Path) -> None:

@@ -106,7 +106,7 @@ class Stored:
             with Image.open(io.BytesIO(content)) as picture:
                 if picture.mode != "RGB":  # a conversion would drop transparency, or bits of a depth map
                     raise DatasetError(f"{where}: expected a picture in RGB, got {picture.mode}")
-                return np.asarray(picture)
+                return np.array(picture)
         except DatasetError:
             raise
         # Pillow raises SyntaxError and others for files that are damaged in their own ways.

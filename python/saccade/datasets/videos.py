@@ -26,6 +26,8 @@ TOLERANCE = 1e-4
 MOST_OPEN = 8
 #: Up to so many frames are decoded to reach a later one. For more, decoding starts at a keyframe.
 MOST_AHEAD = 16
+#: How many frames before the wanted one a keyframe is looked for, one after the other; at last the first.
+BACK = (0.0, 32.0, 256.0, float("inf"))
 
 
 @dataclass(frozen=True)
@@ -76,7 +78,8 @@ class Videos:
                 f"{where}: {path}: expected a frame at {time:.6f} s (within {TOLERANCE} s), got "
                 + ("none" if np.isinf(found) else f"the nearest at {found:.6f} s")
             )
-        return Frame(found[1], found[0] - start)
+        # The video keeps its array for the next call, and the caller may write into this one.
+        return Frame(found[1].copy(), found[0] - start)
 
     def close(self) -> None:
         """Closes all videos. The caller has the lock."""
@@ -135,30 +138,50 @@ class _Video:
         self.interval = float(1 / rate) if rate else 1.0
         self.frames: Iterator[av.VideoFrame] = iter(())
         self.last: tuple[float, UInt8Array] | None = None
+        self.is_damaged = False  # whether a frame since the last keyframe was: those after it are made of it
 
     def frame(self, time: float) -> tuple[float, UInt8Array] | float:
         """Time and pixels of the frame at a time; or the time of the nearest frame, if none is there."""
         if self.last is not None and _is_at(self.last[0], time):
             return self.last
-        if self.last is None or not self.last[0] < time < self.last[0] + MOST_AHEAD * self.interval:
-            self.last = None
-            place = max(round(time / self.stream.time_base) - 1, 0)
-            self.container.seek(place, stream=self.stream, backward=True, any_frame=False)
-            self.frames = self.container.decode(self.stream)
-        nearest = float("inf")
+        if self.last is not None and self.last[0] < time < self.last[0] + MOST_AHEAD * self.interval:
+            return self._ahead(time)[0]
+        found: tuple[float, UInt8Array] | float = float("inf")
+        for back in BACK:
+            start = max(time - back * self.interval, 0)
+            self._seek(start)
+            found, is_reached = self._ahead(time)
+            # Frames that stand before a keyframe may be stored after it; decoding then begins too late.
+            if is_reached or not start:
+                break
+        return found
+
+    def _seek(self, time: float) -> None:
+        """Goes to the last keyframe before a time."""
+        place = max(round(time / self.stream.time_base) - 1, 0)
+        self.container.seek(place, stream=self.stream, backward=True, any_frame=False)
+        self.frames = self.container.decode(self.stream)
+        self.is_damaged = False
+
+    def _ahead(self, time: float) -> tuple[tuple[float, UInt8Array] | float, bool]:
+        """What ``frame`` returns, from where the decoder is; and whether that is not after the time."""
+        self.last, nearest, is_reached = None, float("inf"), False
         for frame in self.frames:
             if frame.pts is None:
                 continue
+            self.is_damaged = frame.is_corrupt or (self.is_damaged and not frame.key_frame)
             now = float(frame.time)
             if abs(now - time) < abs(nearest - time):
                 nearest = now
             if _is_at(now, time):
+                if self.is_damaged:
+                    raise ValueError("the frame, or one that it is made of, is damaged")
                 self.last = now, cast("UInt8Array", frame.to_ndarray(format="rgb24"))
-                return self.last
+                return self.last, True
             if now > time:
                 break
-        self.last = None
-        return nearest
+            is_reached = True
+        return nearest, is_reached
 
 
 def _is_at(frame: float, time: float) -> bool:
