@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import csv
+import gc
 import json
 import shutil
+import weakref
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +15,7 @@ import pytest
 import saccade
 from saccade import cli
 from saccade.cli import recorded
-from saccade.evaluation.source import weights_hash
+from saccade.evaluation.source import forget_policy, weights_hash
 from tests.helpers.recorded_cases import Recorded, by_the_policy, demo_policy
 from tests.helpers.recorded_folder import written
 
@@ -211,6 +213,27 @@ def test_a_certificate_holds_here_and_notices_changes(
     file.write_text(json.dumps(other))
     assert run("certify", file, "--json") == 1
     assert [one["holds"] for one in json.loads(capsys.readouterr().out)["findings"]] == [True, False]
+
+
+def test_a_certificate_has_one_policy_in_memory(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    load, most = saccade.Policy.from_pretrained, []
+    loaded: list[weakref.ref[saccade.Policy]] = []
+
+    def counted(*arguments: Any, **options: Any) -> saccade.Policy:
+        gc.collect()
+        most.append(sum(one() is not None for one in loaded))
+        policy = load(*arguments, **options)
+        loaded.append(weakref.ref(policy))
+        return policy
+
+    forget_policy()
+    monkeypatch.setattr(saccade.Policy, "from_pretrained", counted)
+    options = ("--stride", 8, "--num-threads", 1, "--precision", "int8")
+    file = tmp_path / "certificate.json"
+    assert run("evaluate", DEMO, folder, "--out", tmp_path / "out", *options, "--certify", file) == 0
+    assert most == [0, 0, 0]  # with these options, with other threads, in float32
 
 
 @pytest.mark.parametrize("text", ["", "[]", "{}", '{"format": 2}', '{"format": 1, "mse": 3}', "null", "3"])

@@ -81,6 +81,7 @@ def run(args: argparse.Namespace) -> int:
     files = EpisodeFiles(args.out, Predicted)
     files.begin(settings)
     layout = Layout.of(policy.normalizer)
+    del policy  # a certificate loads others
     work = PredictEpisode(source, stride, args.seed, sampling)
     predictions = recorded.computed(work, episodes, files, args, source, "evaluate")
     report = summarised(predictions, layout, stride, args.seed)

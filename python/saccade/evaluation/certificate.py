@@ -18,7 +18,7 @@ from saccade._internal.environment import show_config
 from saccade.errors import InputError
 from saccade.evaluation.prediction import noise_of
 from saccade.evaluation.recordings import Recordings, length_of, observation_at
-from saccade.evaluation.source import Source
+from saccade.evaluation.source import Source, forget_policy
 from saccade.policy.policy import Policy
 
 FORMAT = 1
@@ -217,17 +217,20 @@ def _certified(
     used = policy.head.num_threads
     other = 1 if used > 1 else 2
     keys, normalizer = policy.normalizer.action_slices, policy.normalizer
-    del policy  # one checkpoint at a time is in memory
+    state = _states(policy, data, places)
+    del policy
+    forget_policy()  # one checkpoint at a time is in memory
     options = dict(source.options)
     rethreaded = replace(source, options={**options, "num_threads": other})
     threaded = _actions(rethreaded.policy, data, places, seed, sampling)
+    forget_policy()
     precisions = options.get("precision", "float32")
     names = set(precisions.values()) if isinstance(precisions, Mapping) else {precisions}
     exact = together
     if names != {"float32"}:
         plain = replace(source, options={**options, "precision": "float32"})
         exact = _actions(plain.policy, data, places, seed, sampling)
-    state = _states(source.policy, data, places)
+        forget_policy()
     apart = np.abs(together.astype(np.float64) - exact)
     scaled = [np.asarray(normalizer.normalize_actions(one, state), np.float64) for one in (together, exact)]
     about, config = source.identity(), show_config("dicts")

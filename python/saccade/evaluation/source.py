@@ -91,6 +91,11 @@ def _data(recordings: str) -> Dataset:
     return open_recordings(recordings)
 
 
+def forget_policy() -> None:
+    """Drops the policy that this process has loaded, so that another one finds its memory free."""
+    _policy.cache_clear()
+
+
 def weights_hash(checkpoint: str | Path) -> str:
     """SHA-256 of the weights of a checkpoint, and of the files that decide how they are used.
 
