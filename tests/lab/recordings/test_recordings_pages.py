@@ -59,6 +59,7 @@ def test_an_input_without_a_change_is_on_the_page(tmp_path: Path) -> None:
     pages.diagnosis_page(saccade.diagnose(demo_policy(), data), ABOUT, demo_policy(), data, tmp_path)
     text = (tmp_path / "index.html").read_text(encoding="utf-8")
     assert text.count(pages.SAME) == 2  # the state, and the camera that is black
+    assert "nan" not in re.sub(r"<[^>]*>", "", text).lower()
 
 
 @pytest.mark.parametrize("name", ["evaluation", "diagnosis"])
