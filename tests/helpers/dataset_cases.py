@@ -89,6 +89,18 @@ def write_video(path: Path, frames: Sequence[npt.NDArray[np.uint8]], keyframes: 
         container.mux(stream.encode())
 
 
+def encode(path: Path, codec: str, options: dict[str, str], frames: npt.NDArray[np.uint8]) -> None:
+    """Writes a video of frames at twice their size."""
+    import av
+
+    with av.open(str(path), "w") as container:
+        stream: Any = container.add_stream(codec, rate=FPS, options=options)
+        stream.height, stream.width, stream.pix_fmt = 2 * SIZE[0], 2 * SIZE[1], "yuv420p"
+        for pixels in frames.repeat(2, axis=1).repeat(2, axis=2):
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(pixels, "rgb24")))
+        container.mux(stream.encode())
+
+
 def decoded(path: Path) -> list[tuple[float, npt.NDArray[np.uint8]]]:
     """All frames of a video with their times, decoded from its start."""
     import av
