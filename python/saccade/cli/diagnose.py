@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from saccade._internal.files import write_json
 from saccade.cli import EXIT_OK, output, recorded, require
-from saccade.cli.output import Section, show
+from saccade.cli.output import Section
 
 if TYPE_CHECKING:
     from saccade.diagnosis.report import Diagnosis
@@ -57,13 +57,7 @@ def run(args: argparse.Namespace) -> int:
     written = {**settings, **report.to_json()}
     write_json(args.out / "results.json", written)
     drawn = recorded.write_page("diagnosis_page", report, written, policy, data, args.out)
-    if args.json:
-        output.print_json(written, indent=2)
-        return EXIT_OK
-    show(tables(report))
-    print(f"results  {args.out / 'results.json'}")
-    if drawn:
-        print(f"page     {args.out / 'index.html'}")
+    recorded.print_results(args, written, tables(report), drawn)
     return EXIT_OK
 
 

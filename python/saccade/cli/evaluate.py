@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from saccade._internal import flags as arguments
 from saccade._internal.files import write_atomically, write_json
 from saccade.cli import EXIT_OK, output, recorded, require
-from saccade.cli.output import Section, show
+from saccade.cli.output import Section
 from saccade.errors import InputError
 
 if TYPE_CHECKING:
@@ -22,8 +22,8 @@ if TYPE_CHECKING:
 HELP = "compare a checkpoint's actions with recorded ones"
 EPILOG = """\
 Every --stride steps of an episode, a chunk of actions is predicted from the recorded observation and compared
-with the recorded actions. The error is Isaac-GR00T's; beside it stand those of holding still, of the mean
-action, and of the checkpoint itself with other noise. docs/evaluate.md has the rules.
+with the recorded actions. The error is Isaac-GR00T's, and is compared with those of holding still, of the
+mean action, and of the checkpoint itself with other noise. docs/evaluate.md has the rules.
 
 DIR receives results.json, errors.csv (a row for each episode, step and key) and episodes/ (the actions); with
 the lab also index.html and curves/. A run that was interrupted goes on where it stopped.
@@ -96,13 +96,7 @@ def run(args: argparse.Namespace) -> int:
     if args.certify is not None:
         write_json(args.certify, certify(source, episodes, stride, args.seed, sampling).to_json())
     drawn = recorded.write_page("evaluation_page", report, written, args.out)
-    if args.json:
-        output.print_json(written, indent=2)
-        return EXIT_OK
-    show(tables(report, comparison))
-    print(f"results  {args.out / 'results.json'}")
-    if drawn:
-        print(f"page     {args.out / 'index.html'}")
+    recorded.print_results(args, written, tables(report, comparison), drawn)
     return EXIT_OK
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import importlib.metadata
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -12,6 +12,7 @@ from saccade._internal import extras
 from saccade._internal import flags as arguments
 from saccade._internal.flags import UsageError, add_policy_options, policy_options
 from saccade.cli import LAB, output
+from saccade.cli.output import Section, show
 
 if TYPE_CHECKING:
     from saccade.evaluation.episode_files import EpisodeFiles
@@ -106,15 +107,17 @@ def computed(
     description: str,
 ) -> list[Record]:
     """The records of episodes: those of an earlier run, and the others computed, each written at once."""
-    todo = [episode for episode in episodes if files.load(episode) is None]
-    done = len(episodes) - len(todo)
+    found = {episode: files.load(episode) for episode in episodes}
+    todo = [episode for episode, record in found.items() if record is None]
+    done = len(found) - len(todo)
     with output.progress_bar(description, len(episodes)) as update:
         update(done)
         for episode, record in _each(work, todo, args, source):
             files.save(episode, record)
+            found[episode] = files.load(episode)  # what a later run reads
             done += 1
             update(done)
-    return [one for episode in episodes if (one := files.load(episode)) is not None]
+    return [record for record in found.values() if record is not None]
 
 
 def _each(
@@ -149,3 +152,16 @@ def write_page(name: str, *given: Any) -> bool:
         return False
     draw(*given)
     return True
+
+
+def print_results(
+    args: argparse.Namespace, written: Mapping[str, Any], tables: Sequence[Section], drawn: bool
+) -> None:
+    """Prints results.json, or tables and where the files are."""
+    if args.json:
+        output.print_json(written, indent=2)
+        return
+    show(tables)
+    print(f"results  {args.out / 'results.json'}")
+    if drawn:
+        print(f"page     {args.out / 'index.html'}")

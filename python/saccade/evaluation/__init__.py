@@ -1,4 +1,4 @@
-"""Open-loop evaluation: predicted actions beside recorded ones; ``docs/evaluate.md`` has the rules.
+"""Open-loop evaluation: predicted actions compared with recorded ones; ``docs/evaluate.md`` has the rules.
 
 - ``recordings``: what is needed of a data set; ``prediction``: the chunks of one episode.
 - ``measures``: errors and baselines; ``report``: all of them; ``open_loop``: the function.
