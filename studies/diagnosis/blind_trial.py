@@ -28,7 +28,7 @@ from safetensors.torch import load_file, save_file
 
 import saccade
 from saccade._internal.files import write_json
-from saccade_lab.parallel import Workers, each
+from saccade_lab.parallel import Lost, Workers, each
 from saccade_lab.study.code_version import code_version
 
 EMBEDDINGS = "backbone.eagle_model.language_model.model.embed_tokens.weight"
@@ -93,15 +93,24 @@ class Judge:
 
 
 def judge(work: Path, recordings: Path, jobs: int) -> None:
-    """Diagnoses every copy; does not open the labels."""
+    """Diagnoses every copy that has no verdict yet; does not open the labels."""
     data = saccade.datasets.open(recordings)
     about = {"code": code_version(), "episodes": len(data), "recordings": data.fingerprint()}
-    folders = sorted(str(path) for path in work.iterdir() if path.is_dir())
-    found = {}
+    path = work / "verdicts.json"
+    found: dict[str, Any] = {}
+    if path.exists():
+        earlier = json.loads(path.read_text(encoding="utf-8"))
+        found = earlier.pop("checkpoints")
+        if earlier != about:
+            raise SystemExit(f"{path}: was written with other code or recordings: {earlier}, not {about}")
+    folders = sorted(str(one) for one in work.iterdir() if one.is_dir() and one.name not in found)
     for folder, one in each(Judge(str(recordings)), folders, Workers(jobs=jobs)):
+        if isinstance(one, Lost):
+            print(f"{folder}: {one.reason}", flush=True)
+            continue
         found[Path(folder).name] = one
+        write_json(path, {**about, "checkpoints": dict(sorted(found.items()))})
         print(Path(folder).name, {name: verdict[0] for name, verdict in one["verdicts"].items()}, flush=True)
-    write_json(work / "verdicts.json", {**about, "checkpoints": dict(sorted(found.items()))})
 
 
 def unseal(work: Path, seal: str, out: Path) -> None:
