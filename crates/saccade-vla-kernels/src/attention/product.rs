@@ -226,6 +226,10 @@ impl<A> AttentionProduct<A> {
             }
             for _ in 0..steps {
                 for part in 0..A::FACTORS {
+                    // AVX2 has sixteen registers. Words kept for the second part would take that of a sum, and a
+                    // third more time than words that are read again.
+                    let again = part > 0 && S::LANES < 16;
+                    let b = if again { std::hint::black_box(b) } else { b };
                     let mut columns = [A::column(simd, simd.load_words_ptr(b), part); NV];
                     for (v, column) in columns.iter_mut().enumerate().skip(1) {
                         *column = A::column(simd, simd.load_words_ptr(b.add(v * product.b_vector)), part);
