@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Builds with the oldest Rust that Cargo.toml declares: by `cargo +1.95.0`, or by plain cargo where that is this version.
+# Builds with the oldest Rust that Cargo.toml declares, by `cargo +1.95.0`; where cargo is of this version, everything else does.
 # Downloads nothing. Where neither is installed, this fails and says what to install.
 set -euo pipefail
 cd "$(dirname "$0")/.."
@@ -13,15 +13,16 @@ is_oldest() {
     [[ $("$@" --version 2>/dev/null) == "cargo $oldest."* ]]
 }
 
-if is_oldest cargo "+$oldest.0"; then
-    cargo=(cargo "+$oldest.0")
-elif is_oldest cargo; then
-    cargo=(cargo)
-else
+if is_oldest cargo; then
+    # Everything else is built with it.
+    echo ".ci/oldest_rust.sh: cargo is the oldest, $(cargo --version)"
+    exit
+fi
+is_oldest cargo "+$oldest.0" || {
     echo "the declared Rust $oldest is not installed, so nothing shows that it compiles the code:" \
         "rustup toolchain install $oldest.0 --profile minimal" >&2
     exit 1
-fi
-echo ".ci/oldest_rust.sh: ${cargo[*]} build, $("${cargo[@]}" --version)"
+}
+echo ".ci/oldest_rust.sh: cargo +$oldest.0 build, $(cargo "+$oldest.0" --version)"
 # All four crates, linked as in a wheel: without this feature the binding needs a library of Python.
-exec "${cargo[@]}" build --locked --quiet -p saccade-python --features pyo3/extension-module
+exec cargo "+$oldest.0" build --locked --quiet -p saccade-python --features pyo3/extension-module
