@@ -73,6 +73,16 @@ def rewritten(name: str, column: str, change: Callable[[Any], Any]) -> Change:
     return apply
 
 
+def lines(name: str, change: Callable[[list[Any]], list[Any]]) -> Change:
+    """Changes the objects of a JSON Lines file."""
+
+    def apply(root: Path) -> None:
+        values = [json.loads(line) for line in (root / name).read_text().splitlines()]
+        cases.write_lines(root / name, change(values))
+
+    return apply
+
+
 def put(place: int, value: Any) -> Callable[[list[Any]], list[Any]]:
     return lambda values: [*values[:place], value, *values[place + 1 :]]
 
@@ -199,6 +209,17 @@ OPENING: list[tuple[str, Change, str]] = [
         "chunks_size: expected an integer, at least 1",
     ),
     ("v2.1", edited("meta/info.json", setting("total_episodes", 4)), "info.json counts 4 episodes, got 3"),
+    ("v3.0", edited("meta/info.json", setting("total_frames", 7)), "total_frames: expected"),
+    (
+        "v2.1",
+        lines("meta/episodes_stats.jsonl", lambda rows: rows[:2]),
+        "expected the statistics of every episode, got none of 2",
+    ),
+    (
+        "v2.1",
+        lines("meta/episodes_stats.jsonl", lambda rows: [*rows, rows[1]]),
+        "episode 1 is listed twice",
+    ),
     ("v2.1", edited("meta/info.json", setting("features", [])), "features: expected an object, got list"),
     (
         "v2.1",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -55,3 +56,19 @@ def test_what_cannot_be_downloaded(hub: Hub, tmp_path: Path) -> None:
     assert f"{NAME}: no such path, and it cannot be downloaded" in offline
     hub.gated = True
     assert opened(hub, tmp_path, repr(NAME)).startswith(f"PermissionError path_or_id: {NAME}: the Hub denies")
+
+
+def test_a_command_names_the_commit(hub: Hub, tmp_path: Path) -> None:
+    """Another process, or the reader of a certificate, finds them when the branch has moved."""
+    program = f"""
+import saccade
+from saccade.evaluation.source import Source
+print(Source.of(saccade.demo_checkpoint(), {NAME!r}, {{}}).recordings)
+"""
+    result = run(program, hub.endpoint, tmp_path)
+    assert result.returncode == 0, result.stderr
+    named = result.stdout.strip()
+    assert re.fullmatch(f"{NAME}@[0-9a-f]{{40}}", named)
+    hub.repositories[NAME].commit(files_of(cases.write_old(tmp_path / "moved", "v2.1")))
+    assert opened(hub, tmp_path, repr(named)) == "found 3 (48, 64, 3) v3.0"
+    assert opened(hub, tmp_path, repr(NAME)) == "found 3 (48, 64, 3) v2.1"

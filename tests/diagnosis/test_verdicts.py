@@ -107,3 +107,10 @@ def test_a_verdict_shows_the_main_change_or_the_largest_of_the_others() -> None:
     natural, removal = effect("natural", 0.1, 0.3), effect("removal", 0.5, 0.7)
     assert verdict_of({"a": natural, "b": removal}, SEEN).low == 0.5
     assert verdict_of({"a": removal, "m": effect("main", 0.0, 0.1), "b": natural}, SEEN).high == 0.1
+
+
+def test_a_change_that_few_episodes_allow_is_not_shown() -> None:
+    rare = effect("main", 0.6, 0.8, episodes=4)
+    verdict = verdict_of({"m": rare, "a": effect("natural", 0.01, 0.02)}, SEEN)
+    assert (verdict.name, verdict.high) == ("ignored", 0.02)
+    assert math.isnan(verdict_of({"m": rare}, SEEN).effect)

@@ -6,7 +6,7 @@ import json
 import math
 import os
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -130,6 +130,12 @@ class Info:
                 f"{self.root / 'meta'}: info.json counts {total} episodes, got {len(episodes)}: one is "
                 "missing, or one too many is listed"
             )
+        frames = self.values.get("total_frames")
+        steps = sum(episode.length for episode in episodes)
+        if frames is not None and frames != steps:
+            raise DatasetError(
+                f"{self.where}: total_frames: expected {steps}, those of its episodes, got {frames!r:.60}"
+            )
         seen: set[int] = set()
         there: set[str] = set()
         for episode in episodes:
@@ -205,18 +211,28 @@ def _version_2(info: Info) -> Parts:
         length = _integer(f"{where} {index}: length", row.get("length"), 1)
         tasked = _texts(f"{where} {index}: tasks", row.get("tasks"))
         episodes.append(Episode(index, length, tasked, info.path("data_path", **places), videos))
-    return tasks, tuple(episodes), _recorded(meta) or _by_episode(meta)
+    return tasks, tuple(episodes), _recorded(meta) or _by_episode(meta, episodes)
 
 
-def _by_episode(meta: Path) -> Statistics | None:
+def _by_episode(meta: Path, episodes: Sequence[Episode]) -> Statistics | None:
     """v2.1: the statistics of episodes, as lerobot combines them."""
     path = meta / "episodes_stats.jsonl"
     if not os.path.lexists(path):  # a link to nothing is damaged, not absent
         return None
-    rows = [row.get("stats") for row in _json_lines(path)]
+    rows: dict[int, Any] = {}
+    for row in _json_lines(path):
+        index = _integer(f"{path}: episode_index", row.get("episode_index"))
+        if index in rows:
+            raise DatasetError(f"{path}: episode {index} is listed twice")
+        rows[index] = row.get("stats")
+    absent = [str(episode.index) for episode in episodes if episode.index not in rows]
+    if absent:
+        raise DatasetError(
+            f"{path}: expected the statistics of every episode, got none of {', '.join(absent[:5])}"
+        )
     try:
         with np.errstate(all="ignore"):  # numbers that are not finite are refused when they are asked for
-            return aggregate([_arrays(row) for row in rows])
+            return aggregate([_arrays(rows[episode.index]) for episode in episodes])
     except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise DatasetError(f"{path}: statistics of an unknown form ({error!r})") from None
 

@@ -108,7 +108,7 @@ def decided(changes: Mapping[str, Effect], observation: Effect | None) -> Verdic
         changes: Its changes by name.
         observation: The effect of another observation.
     """
-    possible = {name: one for name, one in changes.items() if one.episodes >= FEWEST_EPISODES}
+    possible = possible_of(changes)
     if observation is None or observation.episodes < FEWEST_EPISODES:
         return "undecided"
     if observation.of_noise.high < DEAF:
@@ -128,10 +128,16 @@ def decided(changes: Mapping[str, Effect], observation: Effect | None) -> Verdic
     return "undecided"
 
 
+def possible_of(changes: Mapping[str, Effect]) -> dict[str, Effect]:
+    """The changes that enough episodes allow."""
+    return {name: one for name, one in changes.items() if one.episodes >= FEWEST_EPISODES}
+
+
 def verdict_of(changes: Mapping[str, Effect], observation: Effect | None) -> Verdict:
     """The verdict on an input, and the effect that it rests on."""
-    main = [one for one in changes.values() if one.kind == "main"]
-    others = sorted(changes.values(), key=lambda one: one.share.value, reverse=True)
+    possible = possible_of(changes).values()
+    main = [one for one in possible if one.kind == "main"]
+    others = sorted(possible, key=lambda one: one.share.value, reverse=True)
     nothing = Estimate(math.nan, math.nan, math.nan)
     shown = next((one.share for one in (*main, *others)), nothing)
     return Verdict(decided(changes, observation), shown.value, shown.low, shown.high, dict(changes))

@@ -12,9 +12,10 @@ from typing import Any
 
 from saccade._internal.environment import show_config
 from saccade._internal.files import sha256_of
-from saccade._internal.hub import locate
+from saccade._internal.hub import commit_of, locate, parse
 from saccade.datasets import Dataset
 from saccade.datasets import open as open_recordings
+from saccade.datasets.source import folder_of
 from saccade.policy.policy import Policy
 
 #: Files of a checkpoint that decide what it computes.
@@ -29,7 +30,7 @@ class Source:
 
     Attributes:
         checkpoint: Path of the checkpoint's directory.
-        recordings: Path or id of the data set.
+        recordings: Path of the data set, or its id and commit.
         options: Keyword arguments of :meth:`saccade.Policy.from_pretrained`, as JSON values.
     """
 
@@ -39,8 +40,14 @@ class Source:
 
     @classmethod
     def of(cls, checkpoint: str | Path, recordings: str, options: Mapping[str, Any]) -> Source:
-        """The source of a checkpoint by its path or id, which is downloaded if need be."""
+        """The source of a checkpoint and recordings by their paths or ids, which are downloaded if need be.
+
+        Recordings with an id are those of one commit, in every process and in a certificate.
+        """
         values = {name: str(value) if isinstance(value, Path) else value for name, value in options.items()}
+        published = parse(recordings)
+        if published is not None:
+            recordings = f"{published[0]}@{commit_of(folder_of(recordings))}"
         return cls(str(locate(checkpoint).path), recordings, values)
 
     @property
