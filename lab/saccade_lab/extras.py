@@ -43,6 +43,7 @@ _SIMULATOR = ("gymnasium", "metaworld", "mujoco", "packaging")
 NEEDS: dict[str, tuple[str, ...]] = {
     "rollout": ("rich", *_SIMULATOR, *_PICTURES, "imageio", "imageio_ffmpeg", "scipy", "cpuinfo"),
     "demos": ("rich", *_SIMULATOR),
+    "demos --env": ("rich", "gymnasium", "mujoco", "libero", "robosuite"),
     "train": ("rich", "matplotlib", "torch", "safetensors"),
     "attention": ("rich", *_SIMULATOR, *_PICTURES, "jinja2", "scipy"),
     "attention --frames": ("rich", *_PICTURES, "jinja2", "scipy"),

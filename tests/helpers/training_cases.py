@@ -14,6 +14,7 @@ import numpy as np
 from saccade_lab.sim import demos
 from saccade_lab.sim.cameras import DEFAULT_CAMERAS
 from saccade_lab.training import train
+from saccade_lab.training.batches import Batches, prompts_of
 from saccade_lab.training.dataset import describe, load_samples
 from saccade_lab.training.settings import TrainingSettings
 
@@ -51,17 +52,17 @@ def recorded() -> Path:
 
 def make_batches(
     recording: Path, settings: TrainingSettings, *, with_later: bool = True
-) -> tuple[train.Run, train.Batches]:
+) -> tuple[train.Run, Batches]:
     """A run before its first step, and what it draws from."""
     config = train.policy_config(settings, RECORDING, TASKS)
     samples, _ = load_samples(recording, TASKS, settings.horizon, config.processor())
     config = train.with_statistics(config, samples)
     run = train.new_run(settings, config, describe(recording, TASKS))
     targets = samples.targets.mean(axis=0), samples.targets.std(axis=0) + np.float32(1e-3)
-    batches = train.Batches(
+    batches = Batches(
         samples,
         config,
-        train.prompts_of(config, config.processor()),
+        prompts_of(config, config.processor()),
         targets,
         settings.batch_size,
         absent_share=settings.absent_share,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -24,6 +25,7 @@ NVIDIA's layout for `saccade rollout --checkpoint DIR` and `saccade.Policy.from_
 settings.json, history.json, loss.png and training.pt. All are written about once a minute. If the command is
 interrupted, run it again: it continues where it stopped, and the weights at the end are the same as those of
 an uninterrupted run. The defaults are those of the bundled policy; `make demo-policy` trains it again.
+On demonstrations of LIBERO the policy is of N1.7's kind or of N1.5's, and is run by `saccade libero DIR`.
 
 examples:
   saccade train --demos out/demos --out out/policy
@@ -31,6 +33,8 @@ examples:
   saccade train --demos out/demos --out out/n0 --num-future-tokens 0
   saccade train --demos out/demos --out out/aligned --alignment-weight 0.2
   saccade train --demos out/demos --out out/quick --training-steps 2000 --num-threads 2
+  saccade train --demos out/libero --out out/libero-policy --num-threads 2
+  saccade train --demos out/libero --out out/libero-n15 --num-threads 2 --version n1.5
 """
 
 # Flag, its smallest value, and what it is.
@@ -73,9 +77,8 @@ NUMBERS = (
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declares the arguments."""
-    from saccade_lab.training.settings import TrainingSettings
+    from saccade_lab.training.settings import LIBERO_SETTINGS
 
-    defaults = TrainingSettings()
     parser.epilog = EPILOG
     parser.add_argument(
         "--demos", type=Path, required=True, metavar="DIR", help="directory written by `saccade demos`"
@@ -83,11 +86,22 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     arguments.add_out(parser, None, "directory of the run")
     arguments.add_num_threads(parser, "threads of torch", 1)
     for flag, smallest, what in INTEGERS:
-        default = getattr(defaults, setting(flag))
-        arguments.add_integer(parser, flag, minimum=smallest, default=default, help=what)
+        arguments.add_integer(parser, flag, minimum=smallest, help=f"{what} ({default_of(flag)})")
     for flag, lowest, limit, what in NUMBERS:
-        default = getattr(defaults, setting(flag))
-        arguments.add_number(parser, flag, minimum=lowest, below=limit, default=default, help=what)
+        help = f"{what} ({default_of(flag)})"
+        arguments.add_number(parser, flag, minimum=lowest, below=limit, help=help)
+    parser.add_argument(
+        "--version",
+        choices=("n1.5", "n1.7"),
+        help="release of GR00T whose layout the checkpoint has; n1.7 only on LIBERO, where it is the default",
+    )
+    arguments.add_integer(
+        parser,
+        "--view-size",
+        minimum=32,
+        help="pixels along each side of a frame as the policy sees it, only on LIBERO "
+        f"(default: {LIBERO_SETTINGS.view_size})",
+    )
     parser.add_argument(
         "--start-from", type=Path, metavar="DIR", help="policy to start from (default: random weights)"
     )
@@ -95,12 +109,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Checks the arguments, then trains."""
+    from saccade_lab.libero.recording import is_recording, read_recordings
     from saccade_lab.sim.demos import recorded_tasks
 
     if args.start_from is not None and not (args.start_from / "model.safetensors").is_file():
         raise FileNotFoundError(f"{args.start_from}: no policy there")
-    recorded_tasks(args.demos)
-    settings = training_settings(args)
+    on_libero = is_recording(args.demos)
+    if on_libero and args.start_from is not None:
+        raise arguments.UsageError("--start-from: not with demonstrations of LIBERO")
+    if not on_libero and (args.version == "n1.7" or args.view_size is not None):
+        raise arguments.UsageError("--version n1.7, --view-size: only with demonstrations of LIBERO")
+    if on_libero:
+        read_recordings(args.demos)
+    else:
+        recorded_tasks(args.demos)
+    settings = training_settings(args, on_libero=on_libero)
     require("train")
     import torch
 
@@ -115,24 +138,44 @@ def run(args: argparse.Namespace) -> int:
                 held_out = "" if now.validation_loss is None else f", held out {now.validation_loss:.3f}"
                 update(now.step, description=f"loss {now.loss:.3f}{held_out}")
 
-            train.train(args.demos, args.out, settings, on_step, start=args.start_from)
+            if on_libero:
+                from saccade_lab.libero.training import train as train_on_libero
+
+                train_on_libero(args.demos, args.out, settings, on_step)
+            else:
+                train.train(args.demos, args.out, settings, on_step, start=args.start_from)
     except KeyboardInterrupt:
         print(f"stopped; the same command continues from {args.out / train.STATE_FILE}")
         return EXIT_INTERRUPTED
-    print(f"policy in {args.out}; try it: saccade rollout --checkpoint {args.out}")
+    tried = f"libero {args.out}" if on_libero else f"rollout --checkpoint {args.out}"
+    print(f"policy in {args.out}; try it: saccade {tried}")
     return EXIT_OK
 
 
-def training_settings(args: argparse.Namespace) -> TrainingSettings:
+def training_settings(args: argparse.Namespace, *, on_libero: bool = False) -> TrainingSettings:
     """The settings that the arguments ask for.
+
+    Args:
+        args: Parsed arguments.
+        on_libero: Whether the demonstrations are of LIBERO, which has other defaults.
 
     Raises:
         InputError: They do not fit each other.
     """
-    from saccade_lab.training.settings import TrainingSettings
+    from saccade_lab.training.settings import LIBERO_SETTINGS, TrainingSettings
 
-    flags = [flag for flag, *_ in (*INTEGERS, *NUMBERS)]
-    return TrainingSettings(**{setting(flag): getattr(args, destination(flag)) for flag in flags})
+    flags = [flag for flag, *_ in (*INTEGERS, *NUMBERS)] + ["--version", "--view-size"]
+    given = {setting(flag): getattr(args, destination(flag)) for flag in flags}
+    defaults = LIBERO_SETTINGS if on_libero else TrainingSettings()
+    return replace(defaults, **{name: value for name, value in given.items() if value is not None})
+
+
+def default_of(flag: str) -> str:
+    """What the help text says of a default."""
+    from saccade_lab.training.settings import LIBERO_SETTINGS, TrainingSettings
+
+    usual, libero = (getattr(one, setting(flag)) for one in (TrainingSettings(), LIBERO_SETTINGS))
+    return f"default: {usual:g}" + (f", on LIBERO {libero:g}" if libero != usual else "")
 
 
 def destination(flag: str) -> str:

@@ -15,7 +15,7 @@ import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -39,6 +39,14 @@ MAX_MISSES = 0.5  # a task is given up if more than this share of at least 20 ep
 DEFAULT_COUNTS = (
     {task.name: 100 for task in DEMO_TASKS} | {"reach": 300} | {task.name: 200 for task in STUDY_TASKS}
 )
+
+
+class Settings(Protocol):
+    """The settings of a recording, of Meta-World or of LIBERO."""
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -76,10 +84,10 @@ class Demonstration:
 
     Attributes:
         images: ``(frames, cameras, H, W, 3)`` uint8.
-        proprio: ``(frames, 4)`` float32.
+        proprio: ``(frames, state_dim)`` float32.
         targets: ``(frames, 6)`` float32, positions of object and goal, metres.
         frame_steps: ``(frames,)`` int32, the control step before which a frame was drawn.
-        actions: ``(steps, 4)`` float32, the expert's action at each step.
+        actions: ``(steps, action_dim)`` float32, the expert's action at each step.
         disturbed: ``(steps,)`` bool, where another action was executed.
     """
 
@@ -89,6 +97,12 @@ class Demonstration:
     frame_steps: npt.NDArray[np.int32]
     actions: npt.NDArray[np.float32]
     disturbed: npt.NDArray[np.bool_]
+
+    def to_bytes(self) -> bytes:
+        """The file of the episode."""
+        file = io.BytesIO()
+        np.savez_compressed(file, **vars(self))
+        return file.getvalue()
 
 
 def record_episode(
@@ -153,11 +167,7 @@ class Recorder:
             lambda: TaskEnvironment(task, image_size=settings.image_size, cameras=settings.cameras),
         )
         demonstration = record_episode(environment, seed, settings)
-        if demonstration is None:
-            return None
-        file = io.BytesIO()
-        np.savez_compressed(file, **vars(demonstration))
-        return file.getvalue()
+        return None if demonstration is None else demonstration.to_bytes()
 
 
 @dataclass
@@ -236,10 +246,28 @@ def record_tasks(
         GraphicsError: OpenGL cannot be loaded.
         SaccadeError: Processes died again and again; the other episodes are recorded.
     """
+    record_with(Recorder(settings), dict.fromkeys(counts, settings), counts, out, on_episode, workers)
+
+
+def record_with(
+    recorder: Callable[[tuple[str, int]], bytes | None],
+    settings: Mapping[str, Settings],
+    counts: Mapping[str, int],
+    out: Path,
+    on_episode: Callable[[str], None],
+    workers: Workers = ALONE,
+) -> None:
+    """Like ``record_tasks``, for any recorder.
+
+    Args:
+        recorder: From a task and a seed to the file of the episode, or None if the expert did not succeed.
+        settings: Of each task.
+        counts, out, on_episode, workers: See ``record_tasks``, which also says what is raised.
+    """
     tasks = {task: Seeds(task, count, out / task) for task, count in counts.items()}
     for task in tasks.values():
         task.directory.mkdir(parents=True, exist_ok=True)
-        claim_directory(task.directory / "recording.json", settings)
+        claim_directory(task.directory / "recording.json", settings[task.task])
     lost = []
     try:
         # Failures of the experts are known only after a round; the next one makes up for them.
@@ -248,7 +276,7 @@ def record_tasks(
             for name, task in tasks.items()
             for seed in task.next_seeds(functools.partial(on_episode, name))
         ]:
-            for (name, seed), file in each(Recorder(settings), items, workers):
+            for (name, seed), file in each(recorder, items, workers):
                 task = tasks[name]
                 if isinstance(file, Lost):
                     lost.append(f"{name} {seed}: {file.reason}")
@@ -274,7 +302,7 @@ def record_task(
     record_tasks({task: count}, out, settings, lambda task: on_episode())
 
 
-def claim_directory(path: Path, settings: RecordingSettings) -> None:
+def claim_directory(path: Path, settings: Settings) -> None:
     """Writes the settings, or checks that they are those of an earlier recording.
 
     Raises:

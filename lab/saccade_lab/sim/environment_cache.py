@@ -3,20 +3,29 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    from saccade_lab.sim.environment import TaskEnvironment
-
-_open: dict[Hashable, TaskEnvironment] = {}  # at most one
+from typing import Any, Protocol, TypeVar
 
 
-def cached_environment(key: Hashable, create: Callable[[], TaskEnvironment]) -> TaskEnvironment:
+class Closable(Protocol):
+    """An environment."""
+
+    def close(self) -> None:
+        """Frees what it holds."""
+        ...
+
+
+Environment = TypeVar("Environment", bound=Closable)
+
+_open: dict[Hashable, Any] = {}  # at most one
+
+
+def cached_environment(key: Hashable, create: Callable[[], Environment]) -> Environment:
     """The environment of that key, created if it is not the one that is open."""
     if key not in _open:
         close()
         _open[key] = create()
-    return _open[key]
+    found: Environment = _open[key]
+    return found
 
 
 def close() -> None:

@@ -19,6 +19,7 @@ from saccade_lab.backbone_sizes import BackboneSizes, eagle_config
 from saccade_lab.random_checkpoint.robot_metadata import metadata
 from saccade_lab.random_checkpoint.tokenizer import token_id, tokenizer
 from saccade_lab.sim.cameras import CameraPose
+from saccade_lab.sim.tasks import TASKS
 
 CONFIG_FILE, TENSOR_FILE = "config.json", "model.safetensors"
 TOKENIZER_FILE, METADATA_FILE = "tokenizer.json", "experiment_cfg/metadata.json"
@@ -121,6 +122,30 @@ class PolicyConfig:
     statistics: Mapping[str, Mapping[str, Mapping[str, list[float]]]] = field(default_factory=dict)
 
     @property
+    def instructions(self) -> tuple[tuple[str, ...], ...]:
+        """The wordings of every task in ``TASKS``."""
+        return tuple(task.instructions for task in TASKS.values())
+
+    @property
+    def impossible(self) -> tuple[tuple[int, ...], ...]:
+        """Per task in ``TASKS``, the tasks of this policy that cannot be done in its scene."""
+        tasks = list(TASKS.values())
+        known = [list(TASKS).index(name) for name in self.simulation.tasks]
+        return tuple(
+            tuple(other for other in known if tasks[other].objects != task.objects) for task in tasks
+        )
+
+    @property
+    def num_cameras(self) -> int:
+        """Views of an observation."""
+        return len(self.simulation.cameras)
+
+    @property
+    def frame_size(self) -> int:
+        """Pixels along each side of a frame."""
+        return self.simulation.image_size
+
+    @property
     def head_config(self) -> HeadConfig:
         """The head's config."""
         return HeadConfig.from_dict(self.head)
@@ -205,14 +230,17 @@ class PolicyConfig:
         write_json(folder / CONFIG_FILE, self.to_dict())
 
 
-def statistics_of(values: npt.NDArray[np.floating[Any]]) -> dict[str, dict[str, list[float]]]:
+def statistics_of(
+    values: npt.NDArray[np.floating[Any]], groups: Mapping[str, int] = GROUPS
+) -> dict[str, dict[str, list[float]]]:
     """Statistics by group, as ``metadata.json`` has them.
 
     Args:
-        values: ``(samples, 4)``, the groups of ``GROUPS`` one after the other.
+        values: ``(samples, width)``, the groups one after the other.
+        groups: How many numbers each group has.
     """
     found, first = {}, 0
-    for name, width in GROUPS.items():
+    for name, width in groups.items():
         group = values[:, first : first + width].astype(np.float64)
         first += width
         low, high = np.quantile(group, (0.01, 0.99), axis=0)

@@ -6,6 +6,7 @@ the same.
 
 import hashlib
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -22,6 +23,7 @@ from saccade_lab.sim.tasks import TASKS
 
 VALIDATION_EVERY = 20  # every 20th demonstration of a task is held out
 PIXEL_CENTRE = np.float32(127.5)  # pixels are scaled as (u8 - 127.5) / 127.5
+N17_REPEATS = 2  # of a frame in the patches of N1.7's tower, which is made for videos
 MIN_VALID_ACTIONS = 4  # a frame with fewer usable actions is left out
 
 
@@ -30,15 +32,15 @@ class Samples:
     """Observations with their chunks. Only the frames are prepared; nothing else is normalised.
 
     Attributes:
-        images: ``(frames, cameras, 3, H, W)`` uint8, see ``prepared``: every recorded frame once, including
+        images: ``(frames, cameras, ...)`` uint8, see ``prepared``: every recorded frame once, including
             those that are only the later frame of a sample.
         now: ``(samples,)`` the index in ``images`` of the observation.
         later: ``(samples,)`` the index of the observation after the chunk was executed, see ``later_frames``.
-        state: ``(samples, 4)`` float32, proprioception.
+        state: ``(samples, state_dim)`` float32, proprioception.
         targets: ``(samples, 6)`` float32, positions of object and goal.
-        actions: ``(samples, horizon, 4)`` float32, zero where not valid.
+        actions: ``(samples, horizon, action_dim)`` float32, zero where not valid.
         mask: ``(samples, horizon, 1)`` float32, 1 where an action is valid.
-        tasks: ``(samples,)`` number of the task in ``TASKS``.
+        tasks: ``(samples,)`` number of the task, in ``TASKS`` or in the suite of LIBERO.
     """
 
     images: npt.NDArray[np.uint8]
@@ -61,7 +63,7 @@ def chunks(demonstration: demos.Demonstration, horizon: int) -> tuple[Float32Arr
     valid up to and including the first disturbed step.
 
     Returns:
-        ``(frames, horizon, 4)`` and ``(frames, horizon, 1)`` of zeros and ones.
+        ``(frames, horizon, action_dim)`` and ``(frames, horizon, 1)`` of zeros and ones.
     """
     steps = demonstration.frame_steps[:, None] + np.arange(horizon)  # (frames, horizon)
     inside = steps < len(demonstration.actions)
@@ -92,15 +94,23 @@ def prepared(images: npt.NDArray[np.uint8], processor: Processor) -> npt.NDArray
         processor: Processor of the policy.
 
     Returns:
-        ``(frames, cameras, 3, image_size, image_size)``.
+        N1.5: ``(frames, cameras, 3, image_size, image_size)``. N1.7: ``(frames, cameras, patches, 768)``,
+        each patch once.
     """
-    views = [processor.frame(image) for image in images.reshape(-1, *images.shape[2:])]
-    pixels = np.rint(np.stack(views) * PIXEL_CENTRE + PIXEL_CENTRE)
+    views = np.stack([processor.frame(image) for image in images.reshape(-1, *images.shape[2:])])
+    if processor.version == "n1.7":  # (views, patches, 3 * 2 * 256): the tower sees every frame twice
+        repeated = views.reshape(*views.shape[:2], 3, N17_REPEATS, -1)
+        views = repeated[:, :, :, 0].reshape(*views.shape[:2], -1)
+    pixels = np.rint(views * PIXEL_CENTRE + PIXEL_CENTRE)
     return np.asarray(pixels.reshape(*images.shape[:2], *pixels.shape[1:]), dtype=np.uint8)
 
 
 def load_samples(
-    directory: Path, tasks: list[str], horizon: int, processor: Processor | None
+    directory: Path,
+    tasks: list[str],
+    horizon: int,
+    processor: Processor | None,
+    numbers: Sequence[int] | None = None,
 ) -> tuple[Samples, Samples]:
     """Training and validation samples, split by demonstration.
 
@@ -110,12 +120,13 @@ def load_samples(
         horizon: Actions in a chunk.
         processor: Processor of the policy, which prepares the frames. None: no frame is read, which saves
             most of the time, and ``images`` is ``(frames, 0, 3, 0, 0)``.
+        numbers: The number that samples have of each task. Default: that in ``TASKS``.
 
     Raises:
         InputError: A task has no demonstrations.
     """
     parts: tuple[list[Samples], list[Samples]] = ([], [])
-    for task in tasks:
+    for task, task_number in zip(tasks, numbers or map(list(TASKS).index, tasks), strict=True):
         found = 0
         episodes = demos.episodes(directory, task, images=processor is not None)
         for number, (_, demonstration) in enumerate(episodes):
@@ -131,7 +142,7 @@ def load_samples(
                 targets=demonstration.targets[keep],
                 actions=actions[keep],
                 mask=mask[keep],
-                tasks=np.full(int(keep.sum()), list(TASKS).index(task), dtype=np.int64),
+                tasks=np.full(int(keep.sum()), task_number, dtype=np.int64),
             )
             held_out = number % VALIDATION_EVERY == VALIDATION_EVERY - 1
             parts[held_out].append(samples)
@@ -147,8 +158,13 @@ def describe(directory: Path, tasks: list[str]) -> dict[str, Any]:
     The digest covers the seeds of the episodes and the settings of the recording, which together determine
     the episodes.
     """
+    return described(directory, tasks, demos.read_settings(directory, tasks).to_dict())
+
+
+def described(directory: Path, tasks: list[str], settings: Any) -> dict[str, Any]:
+    """Like ``describe``, with the settings of the recording as JSON values."""
     seeds = {task: sorted(int(path.stem) for path in (directory / task).glob("[0-9]*.npz")) for task in tasks}
-    recorded = {"settings": demos.read_settings(directory, tasks).to_dict(), "seeds": seeds}
+    recorded = {"settings": settings, "seeds": seeds}
     digest = hashlib.sha256(json.dumps(recorded, sort_keys=True).encode()).hexdigest()
     return {"sha256": digest, "tasks": {task: len(found) for task, found in seeds.items()}}
 

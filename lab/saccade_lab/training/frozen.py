@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -16,7 +17,7 @@ from saccade._internal.arrays import Float32Array
 from saccade._internal.files import write_atomically
 from saccade.backbone.inputs import BackboneInputs
 from saccade_lab.reference.backbone import Backbone, BackboneFeatures
-from saccade_lab.training.dataset import PIXEL_CENTRE, Samples
+from saccade_lab.training.dataset import N17_REPEATS, PIXEL_CENTRE, Samples
 
 FRAMES_AT_ONCE = 64
 
@@ -45,10 +46,24 @@ def padded(
     return ids, mask
 
 
-def pixel_values(images: npt.NDArray[np.uint8]) -> Float32Array:
-    """Frames ``(B, cameras, 3, H, W)`` for the vision tower, ``(B * cameras, 3, H, W)`` in [-1, 1]."""
+def backbone_inputs(
+    images: npt.NDArray[np.uint8], prompts: Sequence[npt.NDArray[np.int64]], length: int = 0
+) -> BackboneInputs:
+    """What a backbone takes.
+
+    Args:
+        images: Frames as ``prepared`` returns them, ``(B, cameras, ...)``. N1.7's are square.
+        prompts, length: See ``padded``.
+    """
     pixels: Float32Array = (images.astype(np.float32) - PIXEL_CENTRE) / PIXEL_CENTRE
-    return pixels.reshape(-1, *pixels.shape[2:])
+    ids, mask = padded(prompts, length)
+    if images.ndim == 5:  # (B, cameras, 3, H, W)
+        return BackboneInputs(pixels.reshape(-1, *pixels.shape[2:]), ids, mask)
+    patches, values = images.shape[2:]
+    side = math.isqrt(patches)
+    twice = np.repeat(pixels.reshape(-1, 3, 1, values // 3), N17_REPEATS, axis=2)
+    grid = np.tile(np.array([1, side, side]), (images.shape[0] * images.shape[1], 1))
+    return BackboneInputs(twice.reshape(-1, N17_REPEATS * values), ids, mask, grid)
 
 
 class FrozenFeatures:
@@ -95,7 +110,7 @@ class FrozenFeatures:
 
     def _inputs(self, frames: npt.NDArray[np.int64]) -> BackboneInputs:
         prompts = [self._prompts[frame] for frame in frames]
-        return BackboneInputs(pixel_values(self._images[frames]), *padded(prompts, self._length))
+        return backbone_inputs(self._images[frames], prompts, self._length)
 
     def __call__(self, frames: npt.NDArray[np.int64]) -> BackboneFeatures:
         """The features of some frames, as the backbone itself returns them."""

@@ -19,7 +19,7 @@ from saccade_lab.backbone_sizes import BackboneSizes
 from saccade_lab.reference import ActionHead, Backbone
 from saccade_lab.reference.backbone import BackboneFeatures
 from saccade_lab.reference.layers import TABLE_STD, CategoryLinear
-from saccade_lab.sim.settings import PolicyConfig
+from saccade_lab.training.policy_files import PolicyFiles
 from saccade_lab.training.settings import TrainingSettings
 
 NUM_TARGETS = 6  # object and goal position
@@ -123,6 +123,7 @@ class Learner(nn.Module):
                 time=time,
                 action_mask=batch.mask,
                 drop_vl=~seen.attention_mask,
+                **self.masks(seen),
             )
         losses = {"loss": flow}
         if not self.only:
@@ -134,6 +135,12 @@ class Learner(nn.Module):
             targets = self.alignment_targets(batch.later, average)
             losses["alignment_loss"] = 1 - F.cosine_similarity(self.projector(future), targets, dim=-1).mean()
         return losses
+
+    def masks(self, seen: BackboneFeatures) -> dict[str, Tensor]:
+        """The masks that alternating cross-attention takes; none for a head without it."""
+        if self.action_head.config.mask_mode == "none":
+            return {}
+        return {"attention_mask": seen.attention_mask, "image_mask": seen.image_mask}
 
     def seen(self, inputs: BackboneInputs | BackboneFeatures) -> BackboneFeatures:
         """The backbone's features of observations, unless that is what is given."""
@@ -187,7 +194,7 @@ class Learner(nn.Module):
         }
 
 
-def new_learner(settings: TrainingSettings, config: PolicyConfig) -> Learner:
+def new_learner(settings: TrainingSettings, config: PolicyFiles) -> Learner:
     """The modules with their initial weights.
 
     Runs of one seed that differ in N start from the same weights of everything else, and the tokens of the
@@ -196,9 +203,10 @@ def new_learner(settings: TrainingSettings, config: PolicyConfig) -> Learner:
     """
     sizes, head, block = config.backbone_sizes, config.head_config, settings.aligned_block
     torch.manual_seed(settings.seed)
-    drawn = Learner(sizes, replace(head, num_future_tokens=SHARED_TOKENS), block, settings.only)
+    shared = SHARED_TOKENS if head.version == "n1.5" else 0  # later versions have no future tokens
+    drawn = Learner(sizes, replace(head, num_future_tokens=shared), block, settings.only)
     scale_categories(drawn, settings.category_std)
-    if head.num_future_tokens == SHARED_TOKENS:
+    if head.num_future_tokens == shared:
         return drawn
     more = max(0, head.num_future_tokens - SHARED_TOKENS)
     generator = torch.Generator().manual_seed(

@@ -26,7 +26,7 @@ def features_name(start_sha256: str, recording_sha256: str, samples: str) -> str
 CATEGORY_STD = 0.02  # of the released code: `saccade_lab.reference.layers.TABLE_STD`, which needs torch
 RELEASED_WIDTH = 1536  # of GR00T N1.5
 #: Settings that were added after the first runs; see ``TrainingSettings.to_dict``.
-ADDED = ("category_std", "language_dropout")
+ADDED = ("category_std", "language_dropout", "version", "view_size")
 
 
 def released_std(width: int) -> float:
@@ -84,6 +84,9 @@ class TrainingSettings:
         execute_steps: Actions of a chunk that are executed before the next observation.
         num_steps: Euler steps at run time.
         patch_size: Pixels along each side of the patch behind an image token, an even number.
+        version: ``"n1.5"`` or ``"n1.7"``, of which only policies of LIBERO can be.
+        view_size: Pixels along each side of a frame as the tower of a LIBERO policy sees it, a multiple of
+            ``patch_size``; 0 for policies of Meta-World, which see the recorded size.
     """
 
     only: Literal["", "backbone", "head"] = ""
@@ -114,6 +117,8 @@ class TrainingSettings:
     execute_steps: int = 4
     num_steps: int = 4
     patch_size: int = 16
+    version: str = "n1.5"
+    view_size: int = 0
 
     def __post_init__(self) -> None:
         if self.only not in ("", "backbone", "head"):
@@ -180,3 +185,17 @@ class TrainingSettings:
         if self.alignment_weight == 0:
             return None
         return (self.num_layers - 1) // 2 if self.alignment_block is None else self.alignment_block
+
+
+#: The settings of ``saccade train`` on demonstrations of LIBERO. Its scenes have seven objects that look
+#: alike, for which frames are larger than Meta-World's, and of no two of its tasks it is known that the words
+#: of one make no sense in the scene of the other.
+LIBERO_SETTINGS = TrainingSettings(
+    version="n1.7",
+    steps=20_000,
+    absent_share=0.0,
+    num_layers=8,
+    execute_steps=8,
+    patch_size=32,
+    view_size=192,
+)

@@ -16,25 +16,20 @@ import json
 import math
 import re
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import torch
 from safetensors.torch import load_file
 from safetensors.torch import save as serialize
 from torch import Tensor
 
-from saccade._internal.arrays import Float32Array
 from saccade._internal.files import sha256_of, write_atomically, write_json
-from saccade.backbone.inputs import BackboneInputs
 from saccade.errors import InputError
-from saccade.processor import Processor
 from saccade_lab.files import changed
-from saccade_lab.reference.backbone import BackboneFeatures
 from saccade_lab.sim import demos
 from saccade_lab.sim.allocator import keep_freed_memory
 from saccade_lab.sim.settings import (
@@ -48,10 +43,12 @@ from saccade_lab.sim.settings import (
     head_config,
     statistics_of,
 )
-from saccade_lab.sim.tasks import ACTION_DIM, PROPRIO_DIM, TASKS, find_task
-from saccade_lab.training.dataset import Samples, describe, load_samples, normalized_actions
-from saccade_lab.training.frozen import FrozenFeatures, padded, pixel_values
-from saccade_lab.training.learner import Batch, Learner, new_learner
+from saccade_lab.sim.tasks import ACTION_DIM, PROPRIO_DIM, find_task
+from saccade_lab.training.batches import Batches, prompts_of
+from saccade_lab.training.dataset import Samples, describe, load_samples
+from saccade_lab.training.frozen import FrozenFeatures
+from saccade_lab.training.learner import Learner, new_learner
+from saccade_lab.training.policy_files import PolicyFiles
 from saccade_lab.training.settings import STATE_FILE as STATE_FILE
 from saccade_lab.training.settings import TrainingSettings, features_name
 
@@ -80,7 +77,7 @@ class Run:
     """A training run in memory."""
 
     settings: TrainingSettings
-    config: PolicyConfig
+    config: PolicyFiles
     learner: Learner
     optimizer: torch.optim.Optimizer
     average: dict[str, Tensor]
@@ -136,7 +133,7 @@ def with_statistics(config: PolicyConfig, samples: Samples) -> PolicyConfig:
     return replace(config, statistics={kind: statistics_of(values) for kind, values in recorded.items()})
 
 
-def new_run(settings: TrainingSettings, config: PolicyConfig, demonstrations: dict[str, Any]) -> Run:
+def new_run(settings: TrainingSettings, config: PolicyFiles, demonstrations: dict[str, Any]) -> Run:
     """A run before its first step; for ``demonstrations`` see ``dataset.describe``."""
     learner = new_learner(settings, config)
     matrices = [parameter for parameter in learner.parameters() if parameter.ndim >= 2]
@@ -155,93 +152,6 @@ def learning_rate(settings: TrainingSettings, step: int) -> float:
     """Linear warm-up, then a half cosine to zero."""
     warmup = min(1.0, (step + 1) / WARMUP_STEPS)
     return settings.learning_rate * warmup * 0.5 * (1.0 + math.cos(math.pi * step / settings.steps))
-
-
-class Batches:
-    """Draws batches.
-
-    Args:
-        samples: The samples to draw from.
-        config: Config of the policy.
-        prompts: What ``prompts_of`` returns.
-        targets: Mean and standard deviation of the positions, ``(6,)`` each.
-        batch_size: Frames per batch.
-        absent_share, language_dropout: See ``TrainingSettings``.
-        frozen: The features of the samples' frames, if the backbone is not trained.
-        with_later: Whether batches contain the observations after the chunk was executed.
-    """
-
-    def __init__(
-        self,
-        samples: Samples,
-        config: PolicyConfig,
-        prompts: list[list[npt.NDArray[np.int64]]],
-        targets: tuple[Float32Array, Float32Array],
-        batch_size: int,
-        *,
-        absent_share: float = 0.0,
-        language_dropout: float = 0.0,
-        frozen: FrozenFeatures | None = None,
-        with_later: bool = False,
-    ) -> None:
-        self._samples = samples
-        self._frozen = frozen
-        self._with_later = with_later
-        self._batch_size = batch_size
-        self._absent_share, self._language_dropout = absent_share, language_dropout
-        normalizer = config.normalizer
-        self._state = np.asarray(normalizer.state(samples.state))
-        self._actions = normalized_actions(normalizer, samples.actions) * samples.mask
-        self._targets = (samples.targets - targets[0]) / targets[1]
-        self._prompts = prompts
-        known = [list(TASKS).index(name) for name in config.simulation.tasks]
-        self._impossible = [
-            [other for other in known if list(TASKS.values())[other].objects != task.objects]
-            for task in TASKS.values()
-        ]  # per task, the tasks that cannot be done in its scene
-        self._still = normalized_actions(normalizer, np.zeros(samples.actions.shape[1:], np.float32))
-
-    def draw(self, *key: int) -> Batch:
-        """The batch of ``key``, with a wording drawn for each frame."""
-        rng = np.random.default_rng(key)
-        rows = rng.integers(len(self._samples), size=self._batch_size)
-        tasks, later = self._samples.tasks[rows], self._samples.later[rows]
-        actions, mask = self._actions[rows], self._samples.mask[rows]
-        is_absent = np.zeros(len(rows), dtype=bool)
-        for row in np.flatnonzero(rng.random(len(rows)) < self._absent_share):
-            if self._impossible[tasks[row]]:
-                is_absent[row] = True
-                tasks[row] = rng.choice(self._impossible[tasks[row]])
-                actions[row], mask[row] = self._still, 1.0
-                later[row] = self._samples.now[rows[row]]
-        said = [self._prompts[task] for task in tasks]
-        prompts = [prompts[rng.integers(len(prompts))] for prompts in said]
-        if self._language_dropout:
-            for row in np.flatnonzero((rng.random(len(rows)) < self._language_dropout) & ~is_absent):
-                prompts[row] = self._prompts[-1][0]
-        return Batch(
-            inputs=self._inputs(self._samples.now[rows], prompts),
-            state=torch.from_numpy(self._state[rows]),
-            actions=torch.from_numpy(actions),
-            mask=torch.from_numpy(mask),
-            targets=torch.from_numpy(self._targets[rows]),
-            later=self._inputs(later, prompts) if self._with_later else None,
-        )
-
-    def _inputs(
-        self, frames: npt.NDArray[np.int64], prompts: list[npt.NDArray[np.int64]]
-    ) -> BackboneInputs | BackboneFeatures:
-        if self._frozen is not None:
-            return self._frozen(frames)
-        return BackboneInputs(pixel_values(self._samples.images[frames]), *padded(prompts))
-
-
-def prompts_of(config: PolicyConfig, processor: Processor) -> list[list[npt.NDArray[np.int64]]]:
-    """The token ids ``(T,)`` of every wording of every task in ``TASKS``; last, of the released default."""
-    shown = np.zeros((config.simulation.image_size, config.simulation.image_size, 3), np.uint8)
-    frames = [shown] * len(config.simulation.cameras)
-    said: list[tuple[str | None, ...]] = [*(task.instructions for task in TASKS.values()), (None,)]
-    return [[processor(frames, text).input_ids[0] for text in texts] for texts in said]
 
 
 def train_step(run: Run, batches: Batches) -> dict[str, float]:
@@ -292,7 +202,7 @@ def export(run: Run, out: Path) -> None:
     run.config.write(out)
 
 
-def described(config: PolicyConfig) -> Any:
+def described(config: PolicyFiles) -> Any:
     """Config and statistics as they are read from JSON."""
     return json.loads(json.dumps([config.to_dict(), config.metadata()]))
 
@@ -425,15 +335,39 @@ def train(
     run = new_run(settings, config, recorded)
     if start is not None:
         start_from(run, start)
+    fit(run, training, validation, out, on_step, features if settings.only == "head" else None)
+    return config
+
+
+def fit(
+    run: Run,
+    training: Samples,
+    validation: Samples,
+    out: Path,
+    on_step: Callable[[Progress], None],
+    features: Mapping[str, Path] | None = None,
+) -> None:
+    """Trains a new run, or continues the one in ``out``, and writes all files of the run.
+
+    Args:
+        run: The run before its first step.
+        training, validation: The samples.
+        out: Directory of the run.
+        on_step: Called after each step.
+        features: Where only the head is trained, the files of the features of both; see ``features_of``.
+
+    Raises:
+        InputError: ``out`` contains a run with other settings or other demonstrations.
+    """
     if (out / STATE_FILE).exists():
         resume(run, out / STATE_FILE)
+    settings, config = run.settings, run.config
     targets = (training.targets.mean(axis=0), training.targets.std(axis=0) + SMALLEST_DEVIATION)
-
-    prompts = prompts_of(config, processor)
+    prompts = prompts_of(config, config.processor())
 
     def batches_of(samples: Samples, name: str, size: int, **shares: float) -> Batches:
         frozen = None
-        if settings.only == "head":
+        if features is not None:
             frozen = FrozenFeatures(samples, prompts, run.learner.backbone, features[name])
         return Batches(
             samples,
@@ -454,7 +388,6 @@ def train(
     finally:
         if run.step:
             save(run, out)
-    return config
 
 
 def loop(

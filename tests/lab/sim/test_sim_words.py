@@ -16,6 +16,7 @@ from saccade_lab.sim.policy import Policy
 from saccade_lab.sim.rollout import environment_for, run_episode
 from saccade_lab.sim.tasks import TASKS
 from saccade_lab.training import train
+from saccade_lab.training.batches import Batches, prompts_of
 from saccade_lab.training.dataset import Samples
 from saccade_lab.training.settings import TrainingSettings
 
@@ -25,7 +26,7 @@ DEFAULT = "Perform the default behavior."  # Isaac-GR00T N1.5, where there is no
 
 def make_batches(
     tasks: list[str], absent_share: float, language_dropout: float = 0.0
-) -> tuple[train.Batches, Processor]:
+) -> tuple[Batches, Processor]:
     """Batches of random samples of the tasks, and what prepares their words."""
     rng = np.random.default_rng(0)
     numbers = [list(TASKS).index(task) for task in tasks]
@@ -44,8 +45,8 @@ def make_batches(
     config = train.with_statistics(train.policy_config(settings, recording, tasks), samples)
     processor = config.processor()
     targets = np.zeros(6, np.float32), np.ones(6, np.float32)
-    prompts = train.prompts_of(config, processor)
-    batches = train.Batches(
+    prompts = prompts_of(config, processor)
+    batches = Batches(
         samples,
         config,
         prompts,

@@ -16,15 +16,15 @@ from safetensors.torch import load_file
 
 from saccade import InputError
 from saccade._internal.files import sha256_of
-from saccade.backbone.inputs import BackboneInputs
 from saccade_lab.reference import Backbone
 from saccade_lab.sim import demos
 from saccade_lab.sim.policy import Policy
 from saccade_lab.sim.settings import TENSOR_FILE
 from saccade_lab.sim.tasks import find_task
 from saccade_lab.training import dataset, train
+from saccade_lab.training.batches import prompts_of
 from saccade_lab.training.dataset import load_samples
-from saccade_lab.training.frozen import FrozenFeatures, padded, pixel_values
+from saccade_lab.training.frozen import FrozenFeatures, backbone_inputs, padded
 from tests.helpers.training_cases import RECORDING, TASKS, TINY, ignore
 
 BACKBONE = dataclasses.replace(TINY, only="backbone", steps=4, batch_size=4)
@@ -103,7 +103,7 @@ def test_features_of_a_frame_do_not_depend_on_its_batch(
     config = train.policy_config(HEAD, RECORDING, TASKS)
     processor = config.processor()
     samples, _ = load_samples(recording, TASKS, HEAD.horizon, processor)
-    prompts = train.prompts_of(config, processor)
+    prompts = prompts_of(config, processor)
     backbone = Backbone.from_pretrained(pretrained)
     frozen = FrozenFeatures(samples, prompts, backbone, tmp_path / "features.npy")
     rows = np.array([3, 0, len(samples) - 1, 3])
@@ -112,7 +112,7 @@ def test_features_of_a_frame_do_not_depend_on_its_batch(
     for number, row in enumerate(rows):
         images = samples.images[samples.now[[row]]]
         with torch.no_grad():
-            alone = backbone(BackboneInputs(pixel_values(images), said[number][None]))
+            alone = backbone(backbone_inputs(images, [said[number]]))
         length = len(said[number])
         assert not found.attention_mask[number, :-length].any()
         assert found.attention_mask[number, -length:].all()

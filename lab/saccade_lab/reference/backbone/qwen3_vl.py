@@ -21,12 +21,13 @@ class PatchEmbedding(nn.Module):
 
     def __init__(self, sizes: VisionSizes) -> None:
         super().__init__()
-        self.shape = (3, sizes.temporal_patch_size, sizes.patch_size, sizes.patch_size)
-        self.proj = nn.Conv3d(3, sizes.width, kernel_size=self.shape[1:], stride=self.shape[1:])
+        kernel = (sizes.temporal_patch_size, sizes.patch_size, sizes.patch_size)
+        self.proj = nn.Conv3d(3, sizes.width, kernel_size=kernel, stride=kernel)
 
     def forward(self, patches: Tensor) -> Tensor:
         """``(P, values)`` to ``(P, vision_width)``."""
-        return self.proj(patches.unflatten(1, self.shape)).flatten(1)
+        # As a product: torch's convolution of single patches costs four times as much in training.
+        return F.linear(patches, self.proj.weight.flatten(1), self.proj.bias)
 
 
 class SelfAttention(nn.Module):

@@ -1,0 +1,194 @@
+"""Demonstrations of ``libero_object``: the scripted expert, recorded with both cameras of a policy.
+
+They start from layouts that LIBERO's reset draws, spread further by ``placements``, never from an official
+initial state. Episodes, files and their continuation are as in ``saccade_lab.sim.demos``.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from saccade._internal.arrays import Float32Array
+from saccade.datasets import Writer
+from saccade.errors import InputError
+from saccade_lab.libero.checkpoint import ACTION_GROUPS, CAMERAS, CONTROL_HZ, STATE_GROUPS, policy_actions
+from saccade_lab.libero.expert import BasketExpert
+from saccade_lab.libero.placements import wider
+from saccade_lab.libero.recording import LiberoRecording
+from saccade_lab.libero.scene import Scene
+from saccade_lab.libero.suites import SUITES, find_task
+from saccade_lab.parallel import ALONE, Workers
+from saccade_lab.sim import demos, environment_cache
+from saccade_lab.sim.experts import NoiseBursts
+
+if TYPE_CHECKING:
+    from saccade_lab.libero.environment import LiberoEnvironment
+
+EXPERT_SUITES = ("libero_object",)  # in which every task is to put an object into the basket
+DEFAULT_COUNT = 40
+IMAGE_SIZE, FRAME_STRIDE = 256, 5
+MAX_STEPS = 280  # as in evaluations; the expert needs 80 to 210
+SETTLE_STEPS = 10
+STEPS_AFTER_SUCCESS = 8  # so that the last chunks show how to let go
+GOAL = "basket_1"
+ROBOT = "libero_panda"
+#: Milder than Meta-World's, because a step moves the hand further: up to 5 cm instead of 1.
+BURSTS: Mapping[str, Any] = {"start_probability": 0.02, "min_steps": 2, "max_steps": 6}
+
+
+def recording(suite: str, task: int, image_size: int, frame_stride: int) -> LiberoRecording:
+    """The settings of the recording of a task.
+
+    Raises:
+        InputError: The suite has no expert, or there is no such task.
+    """
+    if suite not in EXPERT_SUITES:
+        raise InputError(f"suite: given {suite!r}, expected one with an expert: {', '.join(EXPERT_SUITES)}")
+    return LiberoRecording(suite, task, find_task(suite, task).instruction, image_size, frame_stride)
+
+
+def all_tasks(suite: str) -> tuple[int, ...]:
+    """The numbers of the tasks of a suite."""
+    return tuple(range(SUITES[suite].num_tasks))
+
+
+def start(environment: LiberoEnvironment, task: int, seed: int) -> Scene:
+    """Starts an episode with objects at wider places, and waits until they have come to rest.
+
+    Args:
+        environment: One without official states and without steps for settling.
+        task: Number of the task.
+        seed: Of the layout.
+    """
+    environment.restart(None, seed)
+    inner = environment.simulation.inner
+    _, target, _ = inner.parsed_problem["goal_state"][0]
+    scene = Scene(inner, target, GOAL)
+    names = scene.names()
+    found = {name: scene.position(name)[:2] for name in names}
+    radii = {name: 0.5 * float(np.linalg.norm(np.ptp(scene.points(name)[:, :2], axis=0))) for name in names}
+    for name, place in wider(np.random.default_rng((task, seed)), found, radii, GOAL).items():
+        scene.move(name, place - found[name])
+    for _ in range(SETTLE_STEPS):
+        environment.advance([0, 0, 0, 0, 0, 0, -1])
+    return scene
+
+
+def record_episode(
+    environment: LiberoEnvironment, settings: LiberoRecording, seed: int
+) -> demos.Demonstration | None:
+    """Records one episode of the expert; None if it did not succeed. For ``environment`` see ``start``."""
+    scene = start(environment, settings.task, seed)
+    expert = BasketExpert(scene)
+    bursts = NoiseBursts(np.random.default_rng((settings.task, seed, 1)), **BURSTS)
+    frames: list[tuple[Any, ...]] = []
+    actions: list[Float32Array] = []
+    disturbed: list[bool] = []
+    steps_left, succeeded = MAX_STEPS, False
+    while steps_left > 0:
+        if len(actions) % settings.frame_stride == 0:
+            seen = environment.observe()
+            images = np.stack([seen["images"][name] for name in CAMERAS])
+            frames.append((images, seen["state"], scene.targets(), np.int32(len(actions))))
+        action = expert.action()
+        executed, replaced = bursts.apply(action)
+        actions.append(action)
+        disturbed.append(replaced)
+        steps_left -= 1
+        if environment.advance(executed).success and not succeeded:
+            succeeded, steps_left = True, min(steps_left, STEPS_AFTER_SUCCESS)
+    if not succeeded:
+        return None
+    images, proprio, targets, frame_steps = map(np.stack, zip(*frames, strict=True))
+    return demos.Demonstration(
+        images, proprio, targets, frame_steps, np.stack(actions), np.array(disturbed, dtype=np.bool_)
+    )
+
+
+@dataclass(frozen=True)
+class Recorder:
+    """Records one episode; what a process runs.
+
+    Attributes:
+        settings: Of each task, by the name of its directory.
+    """
+
+    settings: Mapping[str, LiberoRecording]
+
+    def __call__(self, item: tuple[str, int]) -> bytes | None:
+        """The file of the episode of a task and a seed; None if the expert did not succeed."""
+        from saccade_lab.libero.environment import LiberoEnvironment  # needs the simulator
+
+        name, seed = item
+        task = self.settings[name]
+        environment = environment_cache.cached_environment(
+            task,
+            lambda: LiberoEnvironment(
+                task.suite, task.task, image_size=task.image_size, settle_steps=0, official_states=False
+            ),
+        )
+        demonstration = record_episode(environment, task, seed)
+        return None if demonstration is None else demonstration.to_bytes()
+
+
+def record(
+    recordings: list[LiberoRecording],
+    count: int,
+    out: Path,
+    on_episode: Callable[[str], None],
+    workers: Workers = ALONE,
+) -> None:
+    """Records episodes of tasks, less those that are recorded already.
+
+    Args:
+        recordings: The tasks.
+        count: Number of episodes of each.
+        out, on_episode, workers: See ``saccade_lab.sim.demos.record_tasks``, which also says what is raised.
+    """
+    settings = {task.name: task for task in recordings}
+    counts = dict.fromkeys(settings, count)
+    demos.record_with(Recorder(settings), settings, counts, out, on_episode, workers)
+
+
+def export(directory: Path, recordings: list[LiberoRecording], count: int, path: Path) -> None:
+    """Writes the first episodes of a recording as a data set of lerobot's format.
+
+    Keys and units are those of ``saccade_lab.libero.checkpoint``. A step is a control step, and its action
+    the expert's, also where another one was executed.
+
+    Args:
+        directory: The recording, with an observation for every control step.
+        recordings: Its tasks.
+        count: Number of episodes of each.
+        path: The folder of the data set, which must not exist or be empty.
+
+    Raises:
+        InputError: There is something in ``path``, or there is no episode.
+        MissingExtraError: A package of saccade's extra ``data`` is not installed.
+    """
+    size = recordings[0].image_size
+
+    def episodes() -> Iterator[tuple[str, demos.Demonstration]]:
+        for task in recordings:
+            for _, one in itertools.islice(demos.episodes(directory, task.name), count):
+                yield task.instruction, one
+
+    with Writer(
+        path,
+        fps=CONTROL_HZ,
+        robot=ROBOT,
+        cameras=dict.fromkeys(CAMERAS, (size, size)),
+        state=STATE_GROUPS,
+        action=ACTION_GROUPS,
+    ) as writer:
+        for instruction, one in episodes():
+            frames = {name: one.images[:, place] for place, name in enumerate(CAMERAS)}
+            writer.add_episode(
+                instruction, frames=frames, state=one.proprio, action=policy_actions(one.actions)
+            )

@@ -1,0 +1,97 @@
+"""Where a parallel gripper that points straight down takes hold of an object; NumPy only."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+Points = npt.NDArray[np.float64]
+
+MAX_WIDTH = 0.074  # metres between the open fingers of the Panda, less a margin
+MAX_DEPTH = 0.04  # metres that the fingers reach below the top of an object, at most
+DEPTH_SHARE = 0.55  # of the object's height, for low ones
+FLOOR_MARGIN = 0.012  # metres that the fingertips stay above the bottom of the object
+FINGER_REACH = 0.045  # metres from the middle of the hand to an open finger
+FINGER_HALF = (0.012, 0.014)  # half of a finger's size, along the closing axis and across
+FINGER_CLEARANCE = 0.006  # metres between an open finger and a neighbour that cost nothing
+TURN_COST = 0.012  # metres of width that a turn by 90 degrees is worth
+TOO_WIDE_COST = 0.2
+NEIGHBOUR_COST = 3.0
+YAWS = np.radians(np.arange(-90, 90, 5))
+
+
+@dataclass(frozen=True)
+class Grasp:
+    """A grasp from above.
+
+    Attributes:
+        xy: ``(2,)`` metres, where the hand goes down.
+        z: Height of the hand when it closes, metres.
+        yaw: Turn of the hand from its pose at the start, radians in [-pi/2, pi/2).
+        width: Extent of the object along the closing axis, metres.
+        top: Height of the object's highest point, metres.
+        hang: Metres from the hand down to the lowest point of the object that it holds.
+    """
+
+    xy: npt.NDArray[np.float64]
+    z: float
+    yaw: float
+    width: float
+    top: float
+    hang: float
+
+
+def plan_grasp(points: Points, neighbours: Points) -> Grasp:
+    """The grasp over the middle of an object whose closing axis meets the least width.
+
+    The open fingers should also not land on a neighbour. Both are weighed against turning the hand.
+
+    Args:
+        points: ``(n, 3)``, points of the object that span its convex hull, metres.
+        neighbours: ``(m, 2)``, the ground plan of other objects that are as high as the fingertips.
+
+    Example:
+        >>> box = np.array([[x, y, z] for x in (0, 0.03) for y in (0, 0.2) for z in (0, 0.1)])
+        >>> grasp = plan_grasp(box, np.zeros((0, 2)))
+        >>> grasp.xy, round(grasp.z, 3), round(np.degrees(grasp.yaw)), round(grasp.width, 3)
+        (array([0.015, 0.1  ]), 0.06, -90, 0.03)
+    """
+    low, high = points.min(axis=0), points.max(axis=0)
+    z = fingertip_height(points)
+    middle = 0.5 * (low + high)[:2]
+    best = (np.inf, 0.0, 0.0)
+    for yaw in YAWS:
+        closing = np.array([-np.sin(yaw), np.cos(yaw)])
+        along = points[:, :2] @ closing
+        width = float(along.max() - along.min())
+        cost = width + TURN_COST * abs(yaw) / (np.pi / 2) + TOO_WIDE_COST * (width > MAX_WIDTH)
+        clearance = finger_clearance(neighbours - middle, closing)
+        cost += NEIGHBOUR_COST * max(0.0, FINGER_CLEARANCE - clearance)
+        best = min(best, (cost, float(yaw), width))
+    _, yaw, width = best
+    return Grasp(middle, z, yaw, width, top=float(high[2]), hang=z - float(low[2]))
+
+
+def fingertip_height(points: Points) -> float:
+    """The height at which the hand closes on an object, metres; see ``plan_grasp``."""
+    low, high = float(points[:, 2].min()), float(points[:, 2].max())
+    return max(high - min(MAX_DEPTH, DEPTH_SHARE * (high - low)), low + FLOOR_MARGIN)
+
+
+def finger_clearance(neighbours: Points, closing: npt.NDArray[np.float64]) -> float:
+    """Metres from the open fingers to the nearest neighbour, infinite if there is none.
+
+    Args:
+        neighbours: ``(m, 2)``, relative to the middle of the hand.
+        closing: ``(2,)``, the unit vector along which the fingers close.
+    """
+    if not len(neighbours):
+        return np.inf
+    across = np.array([closing[1], -closing[0]])
+    gaps = np.maximum(
+        np.abs(np.abs(neighbours @ closing) - FINGER_REACH) - FINGER_HALF[0],
+        np.abs(neighbours @ across) - FINGER_HALF[1],
+    )
+    return float(gaps.min())

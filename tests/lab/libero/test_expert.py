@@ -1,0 +1,119 @@
+"""The expert in a toy world of points, and its rotations against scipy's."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from saccade._internal.arrays import Float32Array
+from saccade_lab.libero.expert import LIMITS, BasketExpert, Situation, downward, rotation_vector
+from saccade_lab.libero.grasps import Points
+
+STEP, TURN = 0.05, 0.5  # of the controller for an action of 1
+BOX = np.stack(np.meshgrid(*3 * [[-0.5, 0.5]], indexing="ij"), axis=-1).reshape(-1, 3)
+DOWN = np.diag([1.0, -1, -1])
+
+
+class Toy:
+    """A hand that goes where it is told, a box that it can hold, and a basket."""
+
+    def __init__(self, at: tuple[float, float], slips: int = 0) -> None:
+        self.hand, self.turned = np.array([-0.1, 0.0, 0.4]), DOWN.copy()
+        self.size = np.array([0.08, 0.04, 0.1])
+        self.body = np.array([*at, 0.05])
+        self.basket = np.array([0.0, 0.26, 0.05])
+        self.slips = slips  # how often the box is lost while it is carried
+        self.held = False
+
+    def situation(self) -> Situation:
+        goal = self.basket + BOX * [0.2, 0.2, 0.1]
+        return Situation(
+            self.hand.copy(), self.turned.copy(), self.body.copy(), self.body + BOX * self.size, goal
+        )
+
+    def neighbours(self, above: float) -> Points:
+        return np.zeros((0, 2))
+
+    def step(self, action: Float32Array) -> None:
+        assert action.shape == (7,)
+        assert action.dtype == np.float32
+        assert np.abs(action).max() <= 1
+        shift = 0.3 * STEP * action[:3].astype(float)
+        self.turned = Rotation.from_rotvec(0.3 * TURN * action[3:6]).as_matrix() @ self.turned
+        closed = action[6] > 0
+        near = np.abs(self.hand - self.body)
+        if closed and not self.held:
+            self.held = bool((near < [0.03, 0.03, 0.06]).all())
+        self.held = self.held and closed
+        if self.held and self.hand[1] > 0.1 and self.slips:
+            self.slips -= 1
+            self.held = False
+            self.body[:2] -= [0.0, 0.2]
+        if self.held:
+            self.body += shift
+        self.hand += shift
+        if not self.held:
+            self.body[2] = 0.05
+
+    def solved(self) -> bool:
+        return bool((np.abs(self.body - self.basket)[:2] < 0.05).all()) and not self.held
+
+
+@pytest.mark.parametrize("at", [(-0.12, -0.24), (0.15, 0.03), (-0.2, -0.1)])
+@pytest.mark.parametrize("slips", [0, 1])
+def test_it_puts_the_box_into_the_basket(at: tuple[float, float], slips: int) -> None:
+    world = Toy(at, slips)
+    expert = BasketExpert(world)
+    phases = [expert.phase]
+    for _ in range(400):
+        world.step(expert.action())
+        if expert.phase != phases[-1]:
+            phases.append(expert.phase)
+        if world.solved() and expert.phase == "retreat":
+            break
+    assert world.solved()
+    usual = ["above", "down", "close", "lift", "carry", "lower", "open", "retreat"]
+    assert phases == (usual if slips == 0 else [*usual[:5], *usual])
+    assert set(usual) == set(LIMITS)
+
+
+def test_it_begins_again_if_the_box_falls_over() -> None:
+    world = Toy((0.0, -0.1))
+    expert = BasketExpert(world)
+    while expert.phase != "down":
+        world.step(expert.action())
+    world.size = np.array([0.1, 0.08, 0.04])
+    world.body[2] = 0.02
+    expert.action()
+    assert expert.phase == "above"
+
+
+def test_a_phase_ends_after_its_limit() -> None:
+    world = Toy((0.0, -0.1))
+    expert = BasketExpert(world)
+    for _ in range(LIMITS["above"]):  # the hand does not move
+        expert.action()
+    assert expert.phase == "above"
+    expert.action()
+    assert expert.phase == "down"
+
+
+def test_rotation_vectors_are_those_of_scipy() -> None:
+    rng = np.random.default_rng(0)
+    vectors = rng.standard_normal((200, 3))
+    vectors *= (rng.uniform(0, np.pi - 1e-3, 200) / np.linalg.norm(vectors, axis=1))[:, None]
+    found = [rotation_vector(Rotation.from_rotvec(vector).as_matrix()) for vector in vectors]
+    np.testing.assert_allclose(found, vectors, atol=1e-7)
+    np.testing.assert_array_equal(rotation_vector(np.eye(3)), 0)
+    for axis in np.eye(3):  # half a turn, whose axis has two directions
+        half = rotation_vector(Rotation.from_rotvec(np.pi * axis).as_matrix())
+        np.testing.assert_allclose(np.abs(half), np.pi * axis, atol=1e-7)
+
+
+def test_the_hand_points_down_without_turning_far() -> None:
+    for yaw in np.radians([0, 30, 60, 90, 130]):
+        turned = Rotation.from_euler("z", yaw).as_matrix() @ DOWN
+        down = downward(turned)
+        np.testing.assert_array_equal(down[:, 2], [0, 0, -1])
+        assert np.linalg.det(down) == pytest.approx(1)

@@ -1,0 +1,252 @@
+"""Training on made-up recordings of LIBERO: what is written is what the engine reads and computes."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import load_file
+
+import saccade
+from saccade.errors import InputError
+from saccade_lab.libero import training
+from saccade_lab.libero.checkpoint import (
+    ACTION_GROUPS,
+    CAMERAS,
+    EMBODIMENT,
+    LANGUAGE_KEY,
+    STATE_GROUPS,
+    LiberoConfig,
+    recorded_statistics,
+)
+from saccade_lab.libero.recording import describe, is_recording, load_samples, read_recordings
+from saccade_lab.libero.sizes import libero_config
+from saccade_lab.reference import ActionHead, Backbone
+from saccade_lab.training.batches import Batches, prompts_of
+from saccade_lab.training.frozen import backbone_inputs
+from saccade_lab.training.settings import LIBERO_SETTINGS
+from saccade_lab.training.train import Progress, new_run
+from tests.helpers.libero_cases import SAID, SIZE, TINY, demonstration, tiny, write_recording
+
+VERSIONS = ["n1.5", "n1.7"]
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_recording(tmp_path_factory.mktemp("libero-demos"))
+
+
+@pytest.fixture(scope="module", params=VERSIONS)
+def trained(
+    request: pytest.FixtureRequest, recording: Path, tmp_path_factory: pytest.TempPathFactory
+) -> Path:
+    out = tmp_path_factory.mktemp(f"policy-{request.param}") / "run"
+    progress: list[Progress] = []
+    training.train(recording, out, tiny(request.param), progress.append)
+    assert [one.step for one in progress] == [1, 2, 3, 4]
+    assert np.isfinite(progress[-1].loss)
+    return out
+
+
+def test_the_engine_runs_what_was_trained_as_the_reference_does(trained: Path) -> None:
+    policy = saccade.Policy.from_pretrained(trained)
+    version = policy.head.config.version
+    assert policy.head.config.mask_mode == ("alternate" if version == "n1.7" else "none")
+    one = demonstration(3)
+    frames, said = one.images[0], SAID[1]
+    assert policy.processor is not None
+    inputs = policy.processor(dict(zip(CAMERAS, frames, strict=True)), said)
+    backbone = Backbone.from_pretrained(trained)
+    head = ActionHead.from_pretrained(trained)
+    state = policy.normalizer.state(one.proprio[:1])
+    noise = np.random.default_rng(0).standard_normal((1, 16, 7)).astype(np.float32)
+    with torch.no_grad():
+        seen = backbone(inputs)
+        masks = {"attention_mask": seen.attention_mask, "image_mask": seen.image_mask}
+        if version == "n1.5":
+            masks = {}
+        chunk = head.sample(head.encode(seen.backbone_features), state, 0, noise=noise, **masks)
+    expected = policy.normalizer.actions(chunk.numpy())[0]
+    parts = np.split(one.proprio[:1, None], np.cumsum(list(STATE_GROUPS.values()))[:-1], axis=-1)
+    observation = {
+        "video": {name: frame[None, None] for name, frame in zip(CAMERAS, frames, strict=True)},
+        "state": dict(zip(STATE_GROUPS, parts, strict=True)),
+        "language": {LANGUAGE_KEY: [[said]]},
+    }
+    answer = policy.act(observation, noise=noise)
+    found = np.concatenate([answer[name][0] for name in ACTION_GROUPS], axis=-1)
+    assert found.shape == (16, 7)
+    np.testing.assert_allclose(found, expected, atol=1e-4)
+
+
+def test_training_sees_what_the_policy_sees(trained: Path, recording: Path) -> None:
+    policy = saccade.Policy.from_pretrained(trained)
+    assert policy.processor is not None
+    files = libero_config(tiny(policy.head.config.version), SAID, SIZE)
+    tasks = read_recordings(recording)
+    samples, held_out = load_samples(recording, tasks, 16, files.processor())
+    assert held_out is samples  # too few episodes to hold one out
+    prompts = prompts_of(files, files.processor())
+    shown = np.concatenate([demonstration(seed).images for seed in (0, 1, 10, 11)])
+    for row, number in ((0, 0), (len(samples) - 1, 1)):
+        assert samples.tasks[row] == number
+        now = samples.now[row]
+        found = backbone_inputs(samples.images[now : now + 1], [prompts[number][0]])
+        seen = policy.processor(list(shown[now]), SAID[number])
+        np.testing.assert_allclose(found.pixel_values, seen.pixel_values, atol=1e-6)
+        np.testing.assert_array_equal(found.input_ids, seen.input_ids)
+        if found.image_grid_thw is not None:
+            np.testing.assert_array_equal(found.image_grid_thw, seen.image_grid_thw)
+
+
+def test_the_normalizer_is_that_of_the_files(trained: Path) -> None:
+    normalizer = saccade.Normalizer.from_pretrained(trained)
+    assert {group.key: group.size for group in normalizer.state_groups} == STATE_GROUPS
+    assert {group.key: group.size for group in normalizer.action_groups} == ACTION_GROUPS
+    # The gripper of an action is 1 where the expert opens it, and so the policy's is between 0 and 1.
+    bounds = np.stack([np.full((1, 16, 7), side, np.float32) for side in (-1, 1)])
+    grippers = [normalizer.actions(one)[0, 0, -1] for one in bounds]
+    np.testing.assert_allclose(grippers, [0, 1], atol=1e-6)
+
+
+def test_the_checkpoint_is_small_and_names_the_robot(trained: Path) -> None:
+    tensors = load_file(trained / "model.safetensors")
+    assert {name.split(".")[0] for name in tensors} == {"backbone", "action_head"}
+    policy = saccade.Policy.from_pretrained(trained)
+    assert policy.embodiment_id == 0
+    assert EMBODIMENT in repr(policy)
+
+
+def test_the_defaults_have_at_most_six_million_parameters() -> None:
+    for version in VERSIONS:
+        settings = dataclasses.replace(LIBERO_SETTINGS, version=version)
+        with torch.device("meta"):
+            config = libero_config(settings, SAID, 256)
+            backbone, head = Backbone(config.backbone_sizes), ActionHead(config.head_config)
+        count = sum(one.numel() for module in (backbone, head) for one in module.parameters())
+        assert 2e6 < count < 6e6
+
+
+@pytest.mark.parametrize("version", VERSIONS)
+def test_a_padded_prompt_changes_nothing(version: str, recording: Path) -> None:
+    """In a batch, prompts are padded to the longest; each sample's loss is as it is alone."""
+    config = libero_config(tiny(version), SAID, SIZE)
+    tasks = read_recordings(recording)
+    samples, _ = load_samples(recording, tasks, 16, config.processor())
+    run = new_run(tiny(version), with_statistics(config), {})
+    learner, head = run.learner.double(), run.learner.action_head
+    prompts = prompts_of(config, config.processor())
+    assert len(prompts[0][0]) != len(prompts[1][0])
+    rng = np.random.default_rng(0)
+    noise, actions = rng.standard_normal((2, 2, 16, 7))
+    rows = [0, len(samples) - 1]
+
+    def loss(chosen: list[int]) -> float:
+        numbers = [rows.index(row) for row in chosen]
+        seen = learner.backbone(
+            backbone_inputs(samples.images[samples.now[chosen]], [prompts[n][0] for n in numbers])
+        )
+        return float(
+            head.loss(
+                seen.backbone_features,
+                rng_state[numbers],
+                0,
+                actions[numbers],
+                noise=noise[numbers],
+                time=np.array([0.3, 0.6])[numbers],
+                drop_vl=~seen.attention_mask,
+                **learner.masks(seen),
+            )
+        )
+
+    rng_state = rng.standard_normal((2, 8))
+    with torch.no_grad():
+        alone = [loss([row]) for row in rows]
+        assert loss(rows) == pytest.approx(np.mean(alone), rel=1e-9)
+
+
+def with_statistics(config: LiberoConfig) -> LiberoConfig:
+    rng = np.random.default_rng(1)
+    numbers = recorded_statistics(
+        rng.uniform(-1, 1, (9, 8)).astype(np.float32), rng.uniform(-1, 1, (9, 7)).astype(np.float32)
+    )
+    return dataclasses.replace(config, statistics=numbers)
+
+
+def test_actions_after_a_disturbance_and_words_of_each_task(recording: Path) -> None:
+    config = with_statistics(libero_config(TINY, SAID, SIZE))
+    samples, _ = load_samples(recording, read_recordings(recording), 16, config.processor())
+    one = demonstration(0)
+    assert set(np.unique(samples.actions[..., -1][samples.mask[..., 0] > 0])) == {0, 1}
+    np.testing.assert_array_equal(samples.mask[0, :, 0], np.arange(16) <= 9)  # step 9 was disturbed
+    np.testing.assert_array_equal(samples.actions[0, :10, :6], one.actions[:10, :6])
+    np.testing.assert_array_equal(samples.actions[0, :10, 6], 1)  # open
+    np.testing.assert_array_equal(samples.actions[0, 10:], 0)
+    prompts = prompts_of(config, config.processor())
+    batches = Batches(samples, config, prompts, (np.zeros(6, np.float32), np.ones(6, np.float32)), 8)
+    batch = batches.draw(0, 0)
+    assert batch.state.shape == (8, 8)
+    assert batch.actions.shape == (8, 16, 7)
+    assert batch.mask.shape == (8, 16, 1)
+
+
+def test_an_interrupted_run_continues_to_the_same_weights(recording: Path, tmp_path: Path) -> None:
+    def stop(progress: Progress) -> None:
+        if progress.step == 2:
+            raise KeyboardInterrupt
+
+    training.train(recording, tmp_path / "whole", TINY, lambda progress: None)
+    with pytest.raises(KeyboardInterrupt):
+        training.train(recording, tmp_path / "parts", TINY, stop)
+    training.train(recording, tmp_path / "parts", TINY, lambda progress: None)
+    one, other = (load_file(tmp_path / name / "model.safetensors") for name in ("whole", "parts"))
+    assert all(torch.equal(one[name], other[name]) for name in one)
+    with pytest.raises(InputError, match=r"other settings \(seed\)"):
+        training.train(
+            recording, tmp_path / "parts", dataclasses.replace(TINY, seed=1), lambda progress: None
+        )
+
+
+def test_recordings_that_do_not_fit_are_refused(recording: Path, tmp_path: Path) -> None:
+    assert is_recording(recording)
+    assert not is_recording(tmp_path)
+    with pytest.raises(FileNotFoundError, match="no demonstrations found"):
+        read_recordings(tmp_path)
+    assert [task.instruction for task in read_recordings(recording)] == list(SAID)
+    assert describe(recording, read_recordings(recording))["tasks"] == {
+        "libero_object-0": 2,
+        "libero_object-1": 2,
+    }
+    other = write_recording(tmp_path / "other", episodes=0)
+    tasks = read_recordings(other)
+    processor = libero_config(TINY, SAID, SIZE).processor()
+    with pytest.raises(InputError, match="no demonstrations of libero_object-0"):
+        load_samples(other, tasks, 16, processor)
+    path = other / "libero_object-1" / "recording.json"
+    values = json.loads(path.read_text())
+    path.write_text(json.dumps({**values, "frame_stride": 9}))
+    with pytest.raises(InputError, match="different settings"):
+        read_recordings(other)
+    path.write_text(json.dumps({"cameras": [], "image_size": 68, "frame_stride": 3}))
+    with pytest.raises(InputError, match="expected a recording of LIBERO"):
+        read_recordings(other)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"version": "n1.6"}, "version: given 'n1.6', expected one of n1.5, n1.7"),
+        ({"patch_size": 16}, "patch_size: given 16, expected 32"),
+        ({"view_size": 100}, "view_size: given 100, expected a multiple of 32"),
+        ({"view_size": 0}, "view_size: given 0"),
+        ({"absent_share": 0.1}, "absent_share: given 0.1, expected 0"),
+        ({"language_dropout": 0.1}, "language_dropout: given 0.1, expected 0 with n1.7"),
+    ],
+)
+def test_settings_that_no_libero_policy_has_are_refused(change: dict[str, object], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        libero_config(dataclasses.replace(TINY, **change), SAID, SIZE)  # type: ignore[arg-type]
