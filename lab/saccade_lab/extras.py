@@ -39,6 +39,7 @@ LAB = Extras(
 _PICTURES = ("matplotlib", "PIL")
 _TABLES = ("jinja2", "markdown_it", "pandas", "scipy")
 _SIMULATOR = ("gymnasium", "metaworld", "mujoco", "packaging")
+_LIBERO = ("gymnasium", "libero", "mujoco", "packaging", "robosuite")
 #: The optional packages of each command, checked together once its arguments have been parsed.
 NEEDS: dict[str, tuple[str, ...]] = {
     "rollout": ("rich", *_SIMULATOR, *_PICTURES, "imageio", "imageio_ffmpeg", "scipy", "cpuinfo"),
@@ -51,6 +52,7 @@ NEEDS: dict[str, tuple[str, ...]] = {
     "study --features": ("rich", *_PICTURES, *_TABLES, "joblib", "cpuinfo"),
     "study report": (*_PICTURES, *_TABLES),
     "parity": ("torch", "safetensors"),
+    "libero": ("rich", *_LIBERO, *_PICTURES, "imageio", "imageio_ffmpeg", "scipy", "jinja2", "cpuinfo"),
 }
 
 

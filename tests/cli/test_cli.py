@@ -222,9 +222,11 @@ def test_all_that_is_missing_is_named_with_one_command(name: str, tmp_path: Path
         "attention --frames": ["frames"],
         "certify": ["certificate.json"],
         "demos": ["--out", "out"],
+        "demos --env": ["libero_object", "--out", "out"],
         "diagnose": ["checkpoint", "recordings", "--out", "out"],
         "evaluate": ["checkpoint", "recordings", "--out", "out"],
         "inspect --precision-check": ["frames", "checkpoint"],
+        "libero": ["checkpoint"],
         "serve": ["checkpoint"],
         "train": ["--demos", str(tmp_path), "--out", "out"],
     }

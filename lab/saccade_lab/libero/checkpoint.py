@@ -151,9 +151,8 @@ class LiberoConfig:
         if self.version == "n1.7":
             return {EMBODIMENT: {**self.statistics, "relative_action": {}}}
         size = {"resolution": [self.frame_size] * 2, "channels": 3, "fps": float(CONTROL_HZ)}
-        whole = metadata(EMBODIMENT, self.statistics, STATE_GROUPS, dict.fromkeys(CAMERAS, size))
-        whole[EMBODIMENT]["modalities"]["action"]["gripper"]["shape"] = [ACTION_GROUPS["gripper"]]
-        return whole
+        groups = {"state": STATE_GROUPS, "action": ACTION_GROUPS}
+        return metadata(EMBODIMENT, self.statistics, groups, dict.fromkeys(CAMERAS, size))
 
     def write(self, folder: Path) -> None:
         """Writes all files of the policy except its weights."""

@@ -3,6 +3,7 @@
     python -m saccade_lab.random_checkpoint OUT                    N1.5 at its published size, 4.8 GB
     python -m saccade_lab.random_checkpoint OUT --small            a few MB
     python -m saccade_lab.random_checkpoint OUT --version n1.7
+    python -m saccade_lab.random_checkpoint OUT --robot libero     for `saccade libero`
 
 Everything that loads the published checkpoint loads this one, so installation, memory and speed can be tried
 before it is downloaded. Its actions mean nothing. Weights are scaled so that activations stay of order one;
@@ -18,6 +19,7 @@ from pathlib import Path
 
 from saccade.errors import InputError
 from saccade_lab.published import RELEASED
+from saccade_lab.random_checkpoint.robots import ROBOTS
 from saccade_lab.random_checkpoint.whole import small_backbone, small_head, write
 
 
@@ -33,6 +35,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--small", action="store_true", help="a few MB instead of the published size")
     parser.add_argument("--seed", type=int, default=0, help="seed of everything (default 0)")
     parser.add_argument("--head-dtype", choices=("BF16", "F32"), default="BF16", help="default: BF16")
+    parser.add_argument("--robot", choices=ROBOTS, default="arm", help="default: arm")
     parser.add_argument("--outliers", action="store_true", help="plant outlier channels in the backbone")
     args = parser.parse_args(arguments)
     try:
@@ -44,6 +47,7 @@ def main(arguments: list[str] | None = None) -> int:
             seed=args.seed,
             head_dtype=args.head_dtype,
             outliers=args.outliers,
+            robot=args.robot,
         )
     except (InputError, OSError) as error:
         print(error, file=sys.stderr)

@@ -18,14 +18,9 @@ from saccade_lab.backbone_sizes import BackboneSizes, eagle_config, merged
 from saccade_lab.published import CONFIGS, RELEASED, small_config, whole_config
 from saccade_lab.random_checkpoint.backbone_tensors import tensor_shapes, unread_tensor_shapes
 from saccade_lab.random_checkpoint.robot_metadata import metadata
+from saccade_lab.random_checkpoint.robots import ROBOTS, RandomRobot
 from saccade_lab.random_checkpoint.tensors import Outliers, Tensor, write_file
 from saccade_lab.random_checkpoint.tokenizer import FIRST_ADDED, token_id, tokenizer
-
-#: The robot of the checkpoint: its tag and published id, the width of each group of joints, its cameras.
-EMBODIMENT = "new_embodiment"
-EMBODIMENT_IDS = {"n1.5": 31, "n1.6": 10, "n1.7": 10}
-GROUPS = {"single_arm": 5, "gripper": 1}
-CAMERAS = ("front", "wrist")
 
 #: The added token that stands for an image token.
 IMAGE_TOKENS = {"n1.5": "<IMG_CONTEXT>", "n1.6": "<IMG_CONTEXT>", "n1.7": "<|image_pad|>"}
@@ -88,6 +83,7 @@ def write(
     head_dtype: str = "BF16",
     outliers: bool = False,
     shard_bytes: int = 2_500_000_000,
+    robot: str = "arm",
 ) -> Path:
     """Writes a checkpoint: shards with an index, ``config.json``, statistics, ``tokenizer.json``.
 
@@ -102,13 +98,14 @@ def write(
         head_dtype: ``"BF16"`` or ``"F32"``, as published. The backbone is bfloat16.
         outliers: Plants outliers; see :class:`saccade_lab.random_checkpoint.tensors.Outliers`.
         shard_bytes: A shard is complete when it reaches this size.
+        robot: ``"arm"`` for five joints and a gripper, or ``"libero"`` for LIBERO's arm and cameras.
 
     Returns:
         ``folder``.
 
     Raises:
-        InputError: The folder is not empty, or the head takes features of another width or has too few
-            embodiments.
+        InputError: The folder is not empty, the robot is unknown, or the head takes features of another width
+            or has too few embodiments.
         CheckpointError: A config is not one of a head or of a backbone.
         OSError: A file cannot be written.
 
@@ -121,6 +118,9 @@ def write(
     """
     if head_dtype not in ("BF16", "F32"):
         raise InputError(f"head_dtype: expected 'BF16' or 'F32', got {head_dtype!r}")
+    if robot not in ROBOTS:
+        raise InputError(f"robot: unknown name {robot!r}, expected one of {', '.join(ROBOTS)}")
+    owner = ROBOTS[robot]
     if folder.exists() and any(folder.iterdir()):
         raise InputError(f"{folder}: expected an empty directory")
     config = merged(version, backbone or {})
@@ -129,9 +129,9 @@ def write(
     width = head_config["backbone_embedding_dim"]
     if width != sizes.features_width:
         raise InputError(f"head: expected features of width {sizes.features_width}, got {width}")
-    if head_config["max_num_embodiments"] <= EMBODIMENT_IDS[version]:
+    if head_config["max_num_embodiments"] <= owner.ids[version]:
         raise InputError(
-            f"head: expected more than {EMBODIMENT_IDS[version]} embodiments, the id of {EMBODIMENT}, "
+            f"head: expected more than {owner.ids[version]} embodiments, the id of {owner.tags[version]}, "
             f"got {head_config['max_num_embodiments']}"
         )
     tensors = [Tensor(f"backbone.{name}", shape, "BF16") for name, shape in tensor_shapes(sizes)]
@@ -147,7 +147,7 @@ def write(
         folder / "config.json", _config(version, head_config, config, sizes, released=backbone is None)
     )
     write_json(folder / "tokenizer.json", tokenizer(published_ids=sizes.text.vocabulary > FIRST_ADDED))
-    _write_statistics(folder, version, head_config, seed)
+    _write_statistics(folder, version, head_config, seed, owner)
     return folder
 
 
@@ -223,25 +223,25 @@ def _config(
     }
 
 
-def _write_statistics(folder: Path, version: str, head: Mapping[str, Any], seed: int) -> None:
+def _write_statistics(
+    folder: Path, version: str, head: Mapping[str, Any], seed: int, robot: RandomRobot
+) -> None:
     """The robot's statistics and cameras, in the files of the version."""
-    rng = np.random.default_rng(seed)
-    statistics = {
-        kind: {name: _group(rng, width) for name, width in GROUPS.items()} for kind in ("state", "action")
-    }
+    statistics = robot.statistics(np.random.default_rng(seed))
+    tag = robot.tags[version]
     if version == "n1.5":
-        video = {name: {"resolution": [640, 480], "channels": 3, "fps": 30.0} for name in CAMERAS}
+        about = {"resolution": list(robot.resolution), "channels": 3, "fps": 30.0}
+        video = {name: dict(about) for name in robot.cameras}
+        groups = {"state": robot.state, "action": robot.action}
         (folder / "experiment_cfg").mkdir()
-        write_json(
-            folder / "experiment_cfg" / "metadata.json", metadata(EMBODIMENT, statistics, GROUPS, video)
-        )
+        write_json(folder / "experiment_cfg" / "metadata.json", metadata(tag, statistics, groups, video))
         return
-    write_json(folder / "embodiment_id.json", {EMBODIMENT: EMBODIMENT_IDS[version]})
-    write_json(folder / "statistics.json", {EMBODIMENT: {**statistics, "relative_action": {}}})
+    write_json(folder / "embodiment_id.json", {tag: robot.ids[version]})
+    write_json(folder / "statistics.json", {tag: {**statistics, "relative_action": {}}})
     keys: dict[str, tuple[Sequence[str], list[int]]] = {
-        "video": (CAMERAS, [0]),
-        "state": (list(GROUPS), [0]),
-        "action": (list(GROUPS), list(range(16))),
+        "video": (robot.cameras, [0]),
+        "state": (list(robot.state), [0]),
+        "action": (list(robot.action), list(range(16))),
         "language": ([LANGUAGE_KEY], [0]),
     }
     modality_config = {
@@ -258,7 +258,7 @@ def _write_statistics(folder: Path, version: str, head: Mapping[str, Any], seed:
             "max_action_dim": head["max_action_dim"],
             "max_action_horizon": head["action_horizon"],
             "max_state_dim": head["max_state_dim"],
-            "modality_configs": {EMBODIMENT: modality_config},
+            "modality_configs": {tag: modality_config},
             "shortest_image_edge": 256,
             "use_albumentations": True,
             "use_percentiles": True,
@@ -266,12 +266,3 @@ def _write_statistics(folder: Path, version: str, head: Mapping[str, Any], seed:
         },
     }
     write_json(folder / "processor_config.json", values)
-
-
-def _group(rng: np.random.Generator, width: int) -> dict[str, list[float]]:
-    """Statistics of one group of joints."""
-    centre, half = rng.standard_normal(width), 0.1 + rng.random(width)
-    shares = {"max": 1.0, "min": -1.0, "mean": 0.1, "q01": -0.9, "q99": 0.9}
-    return {key: (centre + share * half).tolist() for key, share in shares.items()} | {
-        "std": (half / 2).tolist()
-    }

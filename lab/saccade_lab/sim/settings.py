@@ -204,7 +204,8 @@ class PolicyConfig:
         size = self.simulation.image_size
         about = {"resolution": [size, size], "channels": 3, "fps": 80.0}
         video = {camera.name: about for camera in self.simulation.cameras}
-        return metadata(EMBODIMENT, self.statistics, GROUPS, video)
+        groups = {"state": GROUPS, "action": GROUPS}
+        return metadata(EMBODIMENT, self.statistics, groups, video)
 
     def data_config(self) -> dict[str, Any]:
         """The content of ``experiment_cfg/data_config.json``: groups and cameras, scaled by their bounds."""

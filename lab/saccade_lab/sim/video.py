@@ -29,13 +29,15 @@ class VideoWriter:
 
     Args:
         path: Path of the MP4.
+        frames_per_second: Pictures in a second of the video.
 
     Raises:
         OSError: The video cannot be written; names ``path``.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, frames_per_second: float = FRAMES_PER_SECOND) -> None:
         self._path = path
+        self._frames_per_second = frames_per_second
         self._temporary = path.with_name(f".{path.name}.part.mp4")
         self._font = ImageFont.load_default(size=18)
         self._last: UInt8Array | None = None
@@ -43,7 +45,7 @@ class VideoWriter:
     def __enter__(self) -> "VideoWriter":
         self._writer = imageio.get_writer(
             self._temporary,
-            fps=FRAMES_PER_SECOND,
+            fps=self._frames_per_second,
             codec="libx264",
             quality=7,
             macro_block_size=16,
@@ -55,8 +57,12 @@ class VideoWriter:
         """Adds a picture of the simulation at every second step."""
         if episode.steps % EVERY and not episode.success:
             return
-        self._last = compose(environment, episode, self._font)
-        self._append(self._last)
+        self.append(compose(environment, episode, self._font))
+
+    def append(self, picture: UInt8Array) -> None:
+        """Adds a picture, whose sides are multiples of 16; all of a video have one size."""
+        self._last = picture
+        self._append(picture)
 
     def _append(self, picture: UInt8Array) -> None:
         try:

@@ -49,10 +49,11 @@ LAB_COMMANDS: dict[str, str] = {
     "attention": "show what the rows of the action head attend to",
     "study": "measure what the parts of an action head contribute",
     "parity": "compare the Rust head with the torch reference",
+    "libero": "run a policy on LIBERO and report how often it succeeds, by a released protocol",
     "bench": "time the action head and compare it with the limits of this machine",
 }
-#: Those that need the lab's extra `study`, since they use torch; for the others `sim` is enough.
-NEED_TORCH = ("train", "study", "parity")
+#: The extra of the lab that a command needs; for the others `sim` is enough.
+LAB_EXTRAS = {"train": "study", "study": "study", "parity": "study", "libero": "libero"}
 LAB = "saccade-vla-lab"
 ENTRY_POINTS = "saccade.commands"
 
@@ -133,7 +134,7 @@ def load_command(name: str) -> Command:
         try:
             (entry,) = importlib.metadata.distribution(LAB).entry_points.select(group=ENTRY_POINTS, name=name)
         except (importlib.metadata.PackageNotFoundError, ValueError):
-            install = extras.install_lab("study" if name in NEED_TORCH else "sim")
+            install = extras.install_lab(LAB_EXTRAS.get(name, "sim"))
             raise UsageError(
                 f"{name}: needs {LAB}, which is not installed. Install with: {install}"
             ) from None

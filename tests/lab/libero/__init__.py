@@ -1,0 +1,1 @@
+"""Tests of `saccade_lab.libero` that need no simulator."""

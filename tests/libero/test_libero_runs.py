@@ -1,0 +1,84 @@
+"""`saccade libero` in the simulator: the pinned command, processes, starts of the protocols."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from saccade import cli
+from saccade_lab.libero.environment import LiberoEnvironment
+from saccade_lab.libero.protocols import PROTOCOLS
+from saccade_lab.libero.starts import Starts
+from saccade_lab.sim import environment_cache
+from tests.helpers.libero_runs import DATA_CONFIG, checkpoint
+
+
+def run(out: Path, version: str, *options: str) -> dict[str, Any]:
+    """The results of the command."""
+    assert cli.main(["libero", str(checkpoint(version)), "--out", str(out), *options]) == 0
+    record: dict[str, Any] = json.loads((out / "results.json").read_text())
+    return record
+
+
+def test_the_pinned_command(tmp_path: Path) -> None:
+    options = ("--suite", "libero_object", "--tasks", "0", "--trials", "2", "--protocol", "isaac-n17")
+    record = run(tmp_path / "one", "n1.7", *options)
+    assert [(one["suite"], one["task"], one["trial"]) for one in record["episodes"]] == [
+        ("libero_object", 0, 0),
+        ("libero_object", 0, 1),
+    ]
+    assert all(0 < one["steps"] <= 720 for one in record["episodes"])
+    assert all(set(one) == {"suite", "task", "trial", "success", "steps"} for one in record["episodes"])
+    assert record["packages"]["robosuite"] == "1.4.0"
+    assert record["tasks"][0]["instruction"] == "pick up the alphabet soup and place it in the basket"
+    pictures = [
+        (tmp_path / "one" / "pictures" / f"libero_object-0-{trial}.png").read_bytes() for trial in (0, 1)
+    ]
+    assert pictures[0] != pictures[1]
+
+
+def test_processes_give_the_same_episodes(tmp_path: Path) -> None:
+    options = ["--suite", "libero_object", "--tasks", "7", "--trials", "2", "--protocol", "isaac-n15"]
+    options += ["--data-config", DATA_CONFIG, "--video"]
+    alone = run(tmp_path / "alone", "n1.5", *options)
+    several = run(tmp_path / "several", "n1.5", *options, "--jobs", "2")
+    assert alone["episodes"] == several["episodes"]
+    for trial in (0, 1):
+        names = (f"pictures/libero_object-7-{trial}.png", f"videos/libero_object-7-{trial}.mp4")
+        for name in names:
+            assert (tmp_path / "alone" / name).read_bytes() == (tmp_path / "several" / name).read_bytes()
+
+
+def first_look(starts: Starts, trial: int) -> Any:
+    """Pixels and state at the start of a trial."""
+    starts.begin(trial)
+    seen = starts.environment.observe()
+    return [*(picture.copy() for picture in seen["images"].values()), seen["state"]]
+
+
+@pytest.mark.parametrize("name", PROTOCOLS)
+def test_a_trial_begins_alike_alone_and_after_others(name: str) -> None:
+    protocol = PROTOCOLS[name]
+    environment_cache.close()
+    environment = LiberoEnvironment(
+        "libero_goal",
+        0,
+        image_size=64,
+        settle_steps=protocol.settle_steps,
+        official_states=protocol.official_states,
+    )
+    try:
+        starts = Starts(environment, protocol)
+        looks = []
+        for trial in (0, 1, 2):
+            looks.append(first_look(starts, trial))
+            environment.advance(np.full(7, 0.5, np.float32))
+        again = first_look(Starts(environment, protocol), 2)
+    finally:
+        environment.close()
+    assert all(np.array_equal(one, other) for one, other in zip(looks[2], again, strict=True))
+    assert not np.array_equal(looks[0][0], looks[1][0])
