@@ -13,8 +13,8 @@ VENV := .venv
 ROLLOUT_OUT ?= out/rollout
 ROLLOUT_ARGS ?= --episodes 3 --video
 
-SESSIONS := rollout test lint format bench package setup core test-rust test-python test-compat test-clients test-ray test-aarch64 \
-	test-i686 bench-peers sanitize portable loom fuzz wheel test-wheel demo-policy pictures lock
+SESSIONS := rollout test lint format bench package setup core test-rust test-python test-compat test-clients test-ray test-libero \
+	test-aarch64 test-i686 bench-peers sanitize portable loom fuzz wheel test-wheel demo-policy pictures lock
 
 .DEFAULT_GOAL := help
 MAKEFLAGS += --no-print-directory
@@ -26,6 +26,7 @@ bench-peers: ARGS = $(PEERS_ARGS)
 test-compat: ARGS = $(COMPAT_ARGS)
 test-clients: ARGS = $(CLIENTS_ARGS)
 test-ray: ARGS = $(RAY_ARGS)
+test-libero: ARGS = $(LIBERO_ARGS)
 wheel: ARGS = $(WHEEL_ARGS)
 fuzz: ARGS = $(FUZZ_SECONDS)
 demo-policy: ARGS = $(DEMO_OUT)

@@ -304,6 +304,47 @@ def test_ray(session: nox.Session) -> None:
     environment.run("-m", "pytest", file, *session.posargs, SACCADE_RAY="1", OMP_NUM_THREADS="1")
 
 
+@nox.session(name="test-libero")
+def test_libero(session: nox.Session) -> None:
+    """Test the tasks of LIBERO in the simulator, and against lerobot's and Isaac-GR00T's clients.
+
+    Downloads 550 MB. LIBERO is in no other environment.
+    """
+    below = working(session)  # has torch and lerobot
+    recording = record_libero_clients(session, below)
+    environment = Environment(session, ENVIRONMENTS / "libero")
+    environment.install("libero").install_saccade().install_lab()
+    variables = {"SACCADE_LIBERO": "1", "SACCADE_LIBERO_CLIENTS": str(recording), "OMP_NUM_THREADS": "1"}
+    environment.run("-m", "pytest", "tests/libero", *session.posargs, **variables)
+
+
+def record_libero_clients(session: nox.Session, below: Environment) -> Path:
+    """Records what released clients observe, in an environment on top of another; returns the file."""
+    folder = ENVIRONMENTS / "libero-clients"
+    environment = Environment(session, folder)
+    lists = [ROOT / "tests" / name for name in ("compat/lerobot-0.4.4.txt", "libero/hf-libero.txt")]
+    program = ROOT / "tests" / "libero" / "released_clients.py"
+    made_from = digest(lists)
+    if not environment.is_done("packages", made_from):
+        print("setup: hf-libero and lerobot (takes minutes the first time)", flush=True)
+        where = "import sysconfig; print(sysconfig.get_path('purelib'))"
+        found = (
+            session.run(str(one.python), "-c", where, silent=True, external=True, log=False)
+            for one in (below, environment)
+        )
+        theirs, own = (Path(str(path).strip()) for path in found)
+        (own / "below.pth").write_text(f"{theirs}\n")
+        environment.pip(*(part for file in lists for part in ("--requirement", file)))
+        environment.done("packages", made_from)
+    made_from = digest([*lists, program])
+    if not environment.is_done("recording", made_from):
+        environment.run(
+            program, folder / "recording", OMP_NUM_THREADS="1", LP_NUM_THREADS="0", MUJOCO_GL="egl"
+        )
+        environment.done("recording", made_from)
+    return folder / "recording" / "clients.npz"
+
+
 @nox.session(name="test-aarch64")
 def test_aarch64(session: nox.Session) -> None:
     """Run the Rust tests and some of Python's on emulated 64-bit ARM CPUs, `max` or those given (Debian)."""

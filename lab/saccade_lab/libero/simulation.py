@@ -100,8 +100,12 @@ class Simulation:
                 self._values = self._reset()
             if state is not None:
                 self._values = self._set_state(state)
-            for _ in range(settle_steps):
-                self._step(SETTLE_ACTION)
+            self._settle(settle_steps)
+
+    def settle(self, steps: int) -> None:
+        """Lets objects come to rest: the robot stands still with open gripper."""
+        with self._own_random():
+            self._settle(steps)
 
     def step(self, action: npt.NDArray[np.float64]) -> StepOutcome:
         """One control step of 25 physics steps.
@@ -152,6 +156,10 @@ class Simulation:
             raise RuntimeError(f"an episode of LIBERO ends after {HORIZON} steps, settling included")
         self._values, reward, success, _ = self.inner.step(action)
         return StepOutcome(float(reward), bool(success))
+
+    def _settle(self, steps: int) -> None:
+        for _ in range(steps):
+            self._step(SETTLE_ACTION)
 
     def _reset(self) -> dict[str, Any]:
         """A hard reset; a layout that could not be drawn without overlaps is drawn again."""
