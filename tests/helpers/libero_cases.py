@@ -36,10 +36,10 @@ def tiny(version: str) -> TrainingSettings:
     return dataclasses.replace(TINY, version=version)
 
 
-def demonstration(seed: int, steps: int = 22) -> Demonstration:
+def demonstration(seed: int, steps: int = 22, frame_stride: int = STRIDE) -> Demonstration:
     """A demonstration of random numbers, whose gripper is open first and closed then."""
     rng = np.random.default_rng(seed)
-    frame_steps = np.arange(0, steps, STRIDE, dtype=np.int32)
+    frame_steps = np.arange(0, steps, frame_stride, dtype=np.int32)
     actions = rng.uniform(-1, 1, (steps, 7)).astype(np.float32)
     actions[:, -1] = np.where(np.arange(steps) < steps // 2, -1, 1)
     return Demonstration(
@@ -52,13 +52,14 @@ def demonstration(seed: int, steps: int = 22) -> Demonstration:
     )
 
 
-def write_recording(folder: Path, episodes: int = 2) -> Path:
+def write_recording(folder: Path, episodes: int = 2, frame_stride: int = STRIDE) -> Path:
     """Writes a recording of two tasks."""
     for task, said in enumerate(SAID):
-        settings = LiberoRecording("libero_object", task, said, SIZE, STRIDE)
+        settings = LiberoRecording("libero_object", task, said, SIZE, frame_stride)
         (folder / settings.name).mkdir(parents=True)
         write_json(folder / settings.name / "recording.json", settings.to_dict())
         for episode in range(episodes):
             path = folder / settings.name / f"{1_000_000 + episode}.npz"
-            path.write_bytes(demonstration(10 * task + episode).to_bytes())
+            one = demonstration(10 * task + episode, frame_stride=frame_stride)
+            path.write_bytes(one.to_bytes())
     return folder

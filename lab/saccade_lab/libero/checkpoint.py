@@ -17,7 +17,7 @@ from saccade._internal.arrays import Float32Array
 from saccade._internal.files import write_json
 from saccade.head.config import HeadConfig
 from saccade.processor import Processor
-from saccade.robots import Normalizer
+from saccade.robots import LANGUAGE_KEY, Normalizer
 from saccade_lab.backbone_sizes import BackboneSizes, eagle_config
 from saccade_lab.random_checkpoint.robot_metadata import metadata
 from saccade_lab.random_checkpoint.tokenizer import tokenizer
@@ -36,7 +36,6 @@ VERSIONS = ("n1.5", "n1.7")
 EMBODIMENT = "libero_sim"
 EMBODIMENT_ID = 0
 CAMERAS = ("image", "wrist_image")
-LANGUAGE_KEY = "annotation.human.action.task_description"
 POSE = {"x": 1, "y": 1, "z": 1, "roll": 1, "pitch": 1, "yaw": 1}
 STATE_GROUPS, ACTION_GROUPS = {**POSE, "gripper": 2}, {**POSE, "gripper": 1}
 STATE_DIM, ACTION_DIM = sum(STATE_GROUPS.values()), sum(ACTION_GROUPS.values())

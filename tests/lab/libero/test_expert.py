@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 from saccade._internal.arrays import Float32Array
 from saccade_lab.libero.expert import LIMITS, BasketExpert, Situation, downward, rotation_vector
 from saccade_lab.libero.grasps import Points
+from tests.helpers.paths import ROOT
 
 STEP, TURN = 0.05, 0.5  # of the controller for an action of 1
 BOX = np.stack(np.meshgrid(*3 * [[-0.5, 0.5]], indexing="ij"), axis=-1).reshape(-1, 3)
@@ -76,6 +77,34 @@ def test_it_puts_the_box_into_the_basket(at: tuple[float, float], slips: int) ->
     usual = ["above", "down", "close", "lift", "carry", "lower", "open", "retreat"]
     assert phases == (usual if slips == 0 else [*usual[:5], *usual])
     assert set(usual) == set(LIMITS)
+
+
+class Recorded:
+    """An episode of libero_object's second task that the expert solved in the simulator."""
+
+    def __init__(self) -> None:
+        with np.load(ROOT / "tests" / "data" / "libero_expert.npz") as arrays:
+            self.arrays = dict(arrays)
+        self.seen, self.plans = 0, 0
+
+    def situation(self) -> Situation:
+        names = ("hand", "rotation", "body", "target", "goal")
+        self.seen += 1
+        return Situation(**{name: self.arrays[name][self.seen - 1] for name in names})
+
+    def neighbours(self, above: float) -> Points:
+        self.plans += 1
+        return np.asarray(self.arrays["neighbours"][self.plans - 1])
+
+
+def test_in_a_recorded_episode_it_does_what_solved_the_task() -> None:
+    """The first attempt failed, so the episode has each phase, some of them twice."""
+    recorded = Recorded()
+    expert = BasketExpert(recorded)
+    for action, phase in zip(recorded.arrays["actions"], recorded.arrays["phases"], strict=True):
+        np.testing.assert_allclose(expert.action(), action, atol=1e-6)
+        assert expert.phase == phase
+    assert recorded.plans == 2
 
 
 def test_it_begins_again_if_the_box_falls_over() -> None:

@@ -20,7 +20,10 @@ SMALL = [
 ]
 
 
-def test_a_policy_is_trained_and_loads(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_policy_is_trained_and_loads(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("saccade_lab.training.train.VALIDATION_FRAMES", 3)
     demos, out = write_recording(tmp_path / "demos"), tmp_path / "policy"
     assert main(["train", "--demos", str(demos), "--out", str(out), *SMALL]) == 0
     assert f"saccade libero {out}" in capsys.readouterr().out

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -13,12 +14,12 @@ from safetensors.torch import load_file
 
 import saccade
 from saccade.errors import InputError
-from saccade_lab.libero import training
+from saccade.robots import LANGUAGE_KEY
+from saccade_lab.libero import demos, training
 from saccade_lab.libero.checkpoint import (
     ACTION_GROUPS,
     CAMERAS,
     EMBODIMENT,
-    LANGUAGE_KEY,
     STATE_GROUPS,
     LiberoConfig,
     recorded_statistics,
@@ -33,6 +34,14 @@ from saccade_lab.training.train import Progress, new_run
 from tests.helpers.libero_cases import SAID, SIZE, TINY, demonstration, tiny, write_recording
 
 VERSIONS = ["n1.5", "n1.7"]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def few_held_out_frames() -> Iterator[None]:
+    """Training measures its loss on fewer frames, which takes most of the time of so short runs."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("saccade_lab.training.train.VALIDATION_FRAMES", 3)
+        yield
 
 
 @pytest.fixture(scope="module")
@@ -101,6 +110,25 @@ def test_training_sees_what_the_policy_sees(trained: Path, recording: Path) -> N
         np.testing.assert_array_equal(found.input_ids, seen.input_ids)
         if found.image_grid_thw is not None:
             np.testing.assert_array_equal(found.image_grid_thw, seen.image_grid_thw)
+
+
+def test_a_data_set_of_the_demonstrations_fits_the_policy(trained: Path, tmp_path: Path) -> None:
+    recording = write_recording(tmp_path / "demos", frame_stride=1)
+    demos.export(recording, read_recordings(recording), 1, tmp_path / "data")
+    policy = saccade.Policy.from_pretrained(trained)
+    data = saccade.datasets.open(tmp_path / "data").for_policy(policy)
+    assert (len(data), data.fps, data.tasks) == (2, 20, SAID)
+    one = demonstration(10, frame_stride=1)
+    np.testing.assert_array_equal(data.frame(1, 5, "wrist_image").pixels, one.images[5, 1])
+    state = np.concatenate([data.state(1, 5)[name] for name in STATE_GROUPS], axis=-1)
+    np.testing.assert_array_equal(np.ravel(state), one.proprio[5])
+    actions = np.concatenate([data.actions(1, 5)[name] for name in ACTION_GROUPS], axis=-1)
+    np.testing.assert_array_equal(actions[:, :6], one.actions[5:21, :6])
+    np.testing.assert_array_equal(actions[:, 6], one.actions[5:21, 6] < 0)  # 1 is open
+    answer = policy.act(data.observation(1, 5), seed=0)
+    assert {name: part.shape[1:] for name, part in answer.items()} == {
+        name: (16, width) for name, width in ACTION_GROUPS.items()
+    }
 
 
 def test_the_normalizer_is_that_of_the_files(trained: Path) -> None:

@@ -1,0 +1,149 @@
+"""The expert and its recordings in the simulator."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import saccade
+from saccade.cli import main
+from saccade_lab.libero import demos
+from saccade_lab.libero.checkpoint import ACTION_GROUPS, CAMERAS, STATE_GROUPS
+from saccade_lab.libero.environment import LiberoEnvironment
+from saccade_lab.libero.expert import BasketExpert
+from saccade_lab.libero.recording import read_recordings
+from saccade_lab.libero.scene import Scene
+from saccade_lab.parallel import Workers
+from saccade_lab.sim import environment_cache
+from saccade_lab.sim.demos import load
+from saccade_lab.sim.tasks import DEMONSTRATION_SEEDS
+
+SEED = DEMONSTRATION_SEEDS.start
+SMALL = demos.recording("libero_object", 6, image_size=32, frame_stride=30)
+
+
+@pytest.fixture(autouse=True)
+def closed() -> Iterator[None]:
+    yield
+    environment_cache.close()
+
+
+@pytest.mark.parametrize("task", [1, 4])
+def test_the_expert_solves_official_starts(task: int) -> None:
+    environment = LiberoEnvironment("libero_object", task)
+    environment.restart(3, 0)
+    inner = environment.simulation.inner
+    expert = BasketExpert(Scene(inner, inner.parsed_problem["goal_state"][0][1], demos.GOAL))
+    for _ in range(demos.MAX_STEPS):
+        if environment.advance(expert.action()).success:
+            break
+    environment.close()
+    assert environment.success
+    assert 60 < environment.steps < 220
+
+
+def test_an_episode_depends_on_its_task_and_seed_only() -> None:
+    recorder = demos.Recorder({SMALL.name: SMALL})
+    first = recorder((SMALL.name, SEED))
+    assert first is not None
+    assert recorder((SMALL.name, SEED + 1)) != first
+    assert recorder((SMALL.name, SEED)) == first
+    environment_cache.close()
+    assert recorder((SMALL.name, SEED)) == first
+
+
+def test_a_recording_shows_what_happened(tmp_path: Path) -> None:
+    environment = LiberoEnvironment("libero_object", 6, image_size=32, settle_steps=0, official_states=False)
+    episode = demos.record_episode(environment, SMALL, SEED)
+    assert episode is not None
+    steps = len(episode.actions)
+    np.testing.assert_array_equal(episode.frame_steps, np.arange(0, steps, 30))
+    assert episode.images.shape == (len(episode.frame_steps), 2, 32, 32, 3)
+    assert episode.proprio.shape == (len(episode.frame_steps), 8)
+    # The same actions, or where the expert was disturbed other ones, lead to the same observations.
+    demos.start(environment, 6, SEED)
+    undisturbed = int(np.argmax(episode.disturbed)) if episode.disturbed.any() else steps
+    for step in range(undisturbed):
+        if step % 30 == 0:
+            seen = environment.observe()
+            np.testing.assert_array_equal(seen["state"], episode.proprio[step // 30])
+            images = np.stack([seen["images"][name] for name in CAMERAS])
+            np.testing.assert_array_equal(images, episode.images[step // 30])
+        environment.advance(episode.actions[step])
+    environment.close()
+
+
+def test_starts_are_wider_than_the_official_ones() -> None:
+    environment = LiberoEnvironment("libero_object", 1, settle_steps=0, official_states=False)
+    places = []
+    for seed in range(SEED, SEED + 6):
+        scene = demos.start(environment, 1, seed)
+        places.append([scene.position(name) for name in scene.names()])
+        assert np.abs(environment.simulation.data.qvel).max() < 0.5  # all have come to rest
+    found = np.array(places)
+    assert found[..., 2].min() > -0.01  # none has fallen through the floor
+    assert found[..., :2].std(axis=0).mean() > 0.012  # metres; 3 to 9 mm in the official states
+    environment.close()
+
+
+def test_points_span_the_shapes_of_objects() -> None:
+    """MuJoCo has computed a box around each geom, which the points touch on all sides."""
+    environment = LiberoEnvironment("libero_object", 0, settle_steps=0, official_states=False)
+    environment.restart(None, SEED)
+    model, data = environment.simulation.model, environment.simulation.data
+    scene = Scene(environment.simulation.inner, "alphabet_soup_1", demos.GOAL)
+    for name in scene.names():
+        root = environment.simulation.inner.obj_body_id[name]
+        corners = []
+        for geom in range(model.ngeom):
+            body = model.geom_bodyid[geom]
+            collides = model.geom_contype[geom] or model.geom_conaffinity[geom]
+            if model.body_rootid[body] != model.body_rootid[root] or not collides:
+                continue
+            centre, half = model.geom_aabb[geom, :3], model.geom_aabb[geom, 3:]
+            signs = np.stack(np.meshgrid(*3 * [[-1, 1]], indexing="ij"), axis=-1).reshape(-1, 3)
+            turned = (centre + signs * half) @ data.geom_xmat[geom].reshape(3, 3).T
+            corners.append(data.geom_xpos[geom] + turned)
+        box = np.concatenate(corners)
+        points = scene.points(name)
+        assert (points.min(axis=0) >= box.min(axis=0) - 1e-6).all()
+        assert (points.max(axis=0) <= box.max(axis=0) + 1e-6).all()
+        assert np.ptp(points, axis=0).prod() > 0.4 * np.ptp(box, axis=0).prod()
+    environment.close()
+
+
+def test_the_command_records_a_data_set(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out, record = tmp_path / "demos", tmp_path / "data"
+    arguments = ["demos", "--env", "libero_object", "--tasks", "6", "--episodes", "1", "--image-size", "32"]
+    assert main([*arguments, "--out", str(out), "--record", str(record)]) == 0
+    assert "1 demonstrations" in capsys.readouterr().out
+    (task,) = read_recordings(out)
+    (path,) = (out / task.name).glob("*.npz")
+    one = load(path)
+    data = saccade.datasets.open(record)
+    assert len(data) == 1
+    assert path.stem.isdigit()
+    assert int(path.stem) in DEMONSTRATION_SEEDS
+    assert len(one.actions) == len(one.images)
+    assert data.cameras == CAMERAS
+    assert (data.state_widths, data.action_widths) == (STATE_GROUPS, ACTION_GROUPS)
+    np.testing.assert_array_equal(data.column(0, "observation.state"), one.proprio)
+    actions = data.column(0, "action")
+    np.testing.assert_array_equal(actions[:, :6], one.actions[:, :6])
+    np.testing.assert_array_equal(actions[:, 6], one.actions[:, 6] < 0)  # 1 is open
+    assert data.instruction(0, 0) == task.instruction
+
+
+def test_two_processes_write_the_same_files(tmp_path: Path) -> None:
+    for jobs in (1, 2):
+        demos.record([SMALL], 2, tmp_path / str(jobs), lambda task: None, Workers(jobs=jobs))
+    names = [f"{SMALL.name}/{SEED + index}.npz" for index in range(2)]
+    for name in names:
+        one, other = (
+            dict(np.load(io.BytesIO((tmp_path / str(jobs) / name).read_bytes()))) for jobs in (1, 2)
+        )
+        assert all(np.array_equal(one[key], other[key]) for key in one)
