@@ -26,6 +26,7 @@ from lerobot_policy_saccade.files import (
     folder_of,
 )
 from lerobot_policy_saccade.lerobot_config import saved_options
+from lerobot_policy_saccade.libero import NUM_STEPS, as_in_lerobot, is_libero
 from lerobot_policy_saccade.processor_saccade import make_saccade_pre_post_processors
 from lerobot_policy_saccade.real_time_chunking import continued
 from saccade.robots.data_configs import RELEASED
@@ -75,7 +76,7 @@ class SaccadePolicy(PreTrainedPolicy):
             raise saccade.InputError("checkpoint: expected a path or an id, got none (--policy.checkpoint)")
         self._checkpoint, self._tokenizer = config.checkpoint, config.tokenizer
         self._data_config = config.data_config
-        self.policy = saccade.Policy.from_pretrained(
+        policy = saccade.Policy.from_pretrained(
             config.checkpoint,
             embodiment=_embodiment(config.embodiment),
             preprocessing=config.preprocessing,  # type: ignore[arg-type]  # it is checked there
@@ -87,6 +88,7 @@ class SaccadePolicy(PreTrainedPolicy):
             action_horizon=config.action_horizon,
             processor_options=config.processor_options,
         )
+        self.policy = as_in_lerobot(policy)
         normalizer = self.policy.normalizer
         _check_renames(self.policy.requirements.rename_map)
         width = config.action_feature.shape[-1] if config.action_feature else normalizer.action_width
@@ -100,7 +102,8 @@ class SaccadePolicy(PreTrainedPolicy):
         denoised = self.policy.head.config.action_horizon
         horizon = min(normalizer.action_horizon or denoised, denoised)
         self._trained = min(horizon, normalizer.trained_horizon or horizon)
-        self._steps = _steps(config.n_action_steps, saved.n_action_steps, horizon, self._trained)
+        usual = NUM_STEPS if is_libero(policy) else None
+        self._steps = _steps(config.n_action_steps, saved.n_action_steps or usual, horizon, self._trained)
         features = saved.image_features or _image_features(self.policy)
         config.checkpoint_image_features = features  # type: ignore[misc]  # a field would be saved
         self._actions: deque[Tensor] = deque()
