@@ -122,8 +122,8 @@ class Simulation:
     @property
     def scene(self) -> RecordedScene:
         """The moment that an observation shows."""
-        if self._scene is None:
-            raise RuntimeError("the simulation has not been started: call restart first")
+        self._require_start()
+        assert self._scene is not None  # a start records it
         return self._scene
 
     @property
@@ -138,6 +138,7 @@ class Simulation:
 
     def proprioception(self) -> Proprioception:
         """What the simulator measured of the robot at the moment of ``scene``."""
+        self._require_start()
         names = ("robot0_eef_pos", "robot0_eef_quat", "robot0_gripper_qpos")
         return Proprioception(*(np.array(self._values[name], np.float64) for name in names))
 
@@ -151,7 +152,12 @@ class Simulation:
         if self.inner.sim is not None:
             self.inner.close()
 
+    def _require_start(self) -> None:
+        if not self._values:
+            raise RuntimeError("no episode has been started: call reset or restart first")
+
     def _step(self, action: npt.NDArray[np.float64]) -> StepOutcome:
+        self._require_start()
         if self.inner.done:
             raise RuntimeError(f"an episode of LIBERO ends after {HORIZON} steps, settling included")
         self._values, reward, success, _ = self.inner.step(action)
