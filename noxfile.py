@@ -312,16 +312,26 @@ def test_libero(session: nox.Session) -> None:
     """
     below = working(session)  # has torch and lerobot
     recording = record_libero_clients(session, below)
-    environment = Environment(session, ENVIRONMENTS / "libero")
+    environment = with_setuptools(Environment(session, ENVIRONMENTS / "libero"))
     environment.install("libero").install_saccade().install_lab()
     variables = {"SACCADE_LIBERO": "1", "SACCADE_LIBERO_CLIENTS": str(recording), "OMP_NUM_THREADS": "1"}
     environment.run("-m", "pytest", "tests/libero", *session.posargs, **variables)
 
 
+def with_setuptools(environment: Environment) -> Environment:
+    """Installs setuptools, which builds bddl: it is on the index as source only."""
+    lines = (ROOT / "requirements" / "dev.txt").read_text().splitlines()
+    (setuptools,) = (line for line in lines if line.startswith("setuptools=="))
+    if not environment.is_done("setuptools", setuptools):
+        environment.pip(setuptools)
+        environment.done("setuptools", setuptools)
+    return environment
+
+
 def record_libero_clients(session: nox.Session, below: Environment) -> Path:
     """Records what released clients observe, in an environment on top of another; returns the file."""
     folder = ENVIRONMENTS / "libero-clients"
-    environment = Environment(session, folder)
+    environment = with_setuptools(Environment(session, folder))
     lists = [ROOT / "tests" / name for name in ("compat/lerobot-0.4.4.txt", "libero/hf-libero.txt")]
     program = ROOT / "tests" / "libero" / "released_clients.py"
     made_from = digest(lists)
