@@ -16,7 +16,7 @@ from tests.helpers.libero_cases import write_recording
 
 SMALL = [
     *("--batch-size", "2", "--width", "32", "--num-layers", "2", "--view-size", "32"),
-    *("--training-steps", "2"),
+    *("--training-steps", "1"),
 ]
 
 
@@ -28,7 +28,7 @@ def test_a_policy_is_trained_and_loads(
     assert main(["train", "--demos", str(demos), "--out", str(out), *SMALL]) == 0
     assert f"saccade libero {out}" in capsys.readouterr().out
     settings = json.loads((out / "settings.json").read_text())
-    assert settings["steps"] == 2
+    assert settings["steps"] == 1
     assert settings["version"] == "n1.7"
     assert settings["execute_steps"] == 8
     assert settings["absent_share"] == 0

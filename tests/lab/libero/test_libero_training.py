@@ -22,8 +22,10 @@ from saccade_lab.libero.checkpoint import (
     EMBODIMENT,
     STATE_GROUPS,
     LiberoConfig,
+    policy_actions,
     recorded_statistics,
 )
+from saccade_lab.libero.policy import LiberoPolicy
 from saccade_lab.libero.recording import describe, is_recording, load_samples, read_recordings
 from saccade_lab.libero.sizes import libero_config
 from saccade_lab.reference import ActionHead, Backbone
@@ -37,10 +39,11 @@ VERSIONS = ["n1.5", "n1.7"]
 
 
 @pytest.fixture(scope="module", autouse=True)
-def few_held_out_frames() -> Iterator[None]:
-    """Training measures its loss on fewer frames, which takes most of the time of so short runs."""
+def short_saves() -> Iterator[None]:
+    """The held-out loss and its plot take most of the time of so short runs."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("saccade_lab.training.train.VALIDATION_FRAMES", 3)
+        patch.setattr("saccade_lab.training.train.plot_history", lambda history, path: None)
         yield
 
 
@@ -139,6 +142,23 @@ def test_the_normalizer_is_that_of_the_files(trained: Path) -> None:
     bounds = np.stack([np.full((1, 16, 7), side, np.float32) for side in (-1, 1)])
     grippers = [normalizer.actions(one)[0, 0, -1] for one in bounds]
     np.testing.assert_allclose(grippers, [0, 1], atol=1e-6)
+
+
+def test_every_protocol_of_its_release_runs_it(trained: Path) -> None:
+    whole = saccade.Policy.from_pretrained(trained)
+    one = demonstration(3)
+    seen = {
+        "images": dict(zip(CAMERAS, one.images[0], strict=True)),
+        "state": one.proprio[0],
+        "instruction": SAID[0],
+    }
+    for protocol in ("auto", "lerobot", f"isaac-{whole.head.config.version.replace('.', '')}"):
+        policy = LiberoPolicy(whole, trained, protocol)
+        actions = policy.act(seen, seed=0).actions
+        assert actions.shape == (16, 7)
+        assert set(np.unique(actions[:, -1])) <= {-1, 1}
+        # What was learned from the expert's actions is executed as the expert's actions.
+        np.testing.assert_array_equal(policy.gripper.applied(policy_actions(one.actions)), one.actions)
 
 
 def test_the_checkpoint_is_small_and_names_the_robot(trained: Path) -> None:
