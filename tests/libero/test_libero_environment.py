@@ -242,6 +242,25 @@ def test_the_horizon_of_robosuite_is_named() -> None:
             environment.advance(STAND)
 
 
+def test_a_layout_without_room_is_drawn_again() -> None:
+    from robosuite.utils.errors import RandomizationError
+
+    with make("libero_object", 0, official_states=False, **CHEAP) as environment:
+        inner, tried = environment.simulation.inner, []
+        reset = inner.reset
+
+        def unlucky() -> Any:
+            tried.append(0)
+            if len(tried) < 3:
+                raise RandomizationError("no room")
+            return reset()
+
+        inner.reset = unlucky
+        environment.restart(None, 0)
+        assert len(tried) == 3
+        assert not environment.advance(STAND).success
+
+
 def test_every_suite_has_its_tasks_words_and_states() -> None:
     for suite in SUITES.values():
         for index in range(suite.num_tasks):

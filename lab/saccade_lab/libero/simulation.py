@@ -8,7 +8,7 @@ its own numbers changed.
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -52,7 +52,7 @@ class Simulation:
 
         self._random: tuple[Any, ...] = np.random.RandomState().get_state()  # type: ignore[assignment]
         with self._own_random():
-            self.inner = make_inner(bddl_file)
+            self.inner = until_placed(lambda: make_inner(bddl_file))
         self.moments = 0
         self._scene: RecordedScene | None = None
         self._values: dict[str, Any] = {}
@@ -97,7 +97,7 @@ class Simulation:
                 np.random.seed(seed)  # noqa: NPY002  that is what LIBERO reads
             self.inner.object_property_initializers[:] = self._drawn_properties * loads
             for _ in range(resets):
-                self._values = self._reset()
+                self._values = until_placed(self.inner.reset)
             if state is not None:
                 self._values = self._set_state(state)
             self._settle(settle_steps)
@@ -167,17 +167,6 @@ class Simulation:
         for _ in range(steps):
             self._step(SETTLE_ACTION)
 
-    def _reset(self) -> dict[str, Any]:
-        """A hard reset; a layout that could not be drawn without overlaps is drawn again."""
-        from robosuite.utils.errors import RandomizationError
-
-        while True:
-            try:
-                values: dict[str, Any] = self.inner.reset()
-            except RandomizationError:
-                continue
-            return values
-
     def _set_state(self, state: npt.NDArray[np.float64]) -> dict[str, Any]:
         """LIBERO's ``set_init_state``."""
         self.inner.sim.set_state_from_flattened(state)
@@ -209,6 +198,17 @@ class Simulation:
 
 #: No motion, gripper open; what released clients do until objects have come to rest.
 SETTLE_ACTION = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0])
+
+
+def until_placed(draw: Callable[[], Any]) -> Any:
+    """Calls again while the layout that was drawn has no room for all objects."""
+    from robosuite.utils.errors import RandomizationError
+
+    while True:
+        try:
+            return draw()
+        except RandomizationError:
+            continue
 
 
 def make_inner(bddl_file: Path) -> Any:
