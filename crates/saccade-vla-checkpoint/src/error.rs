@@ -188,6 +188,26 @@ macro_rules! problem {
     };
 }
 
+/// Returns the error with a [`problem!`]: `bail!(Input, "out"; "{path} exists")` for the `Error::Input` of the caller.
+#[doc(hidden)]
+#[macro_export]
+macro_rules! bail {
+    ($kind:ident, $($problem:tt)+) => {
+        return Err(Error::$kind($crate::problem!($($problem)+)))
+    };
+}
+
+/// Returns the error with a [`problem!`] unless something holds: `ensure!(!path.exists(), Input, "out"; "{path} exists")`.
+#[doc(hidden)]
+#[macro_export]
+macro_rules! ensure {
+    ($holds:expr, $kind:ident, $($problem:tt)+) => {
+        if !$holds {
+            $crate::bail!($kind, $($problem)+);
+        }
+    };
+}
+
 /// A problem of no argument.
 impl From<String> for Problem {
     fn from(text: String) -> Self {

@@ -15,9 +15,9 @@ use crate::error::{Error, Problem, Result, probe_allocation, reserve, show_shape
 use crate::header::Header;
 use crate::index::WeightFiles;
 use crate::names::plain_name;
-use crate::problem;
 use crate::source::SourceFile;
 use crate::spec::{self, SCALE_SUFFIX, TensorProblem, TensorSpec};
+use crate::{bail, problem};
 
 /// Bytes that are copied together.
 const PIECE: usize = 1 << 24;
@@ -263,7 +263,7 @@ impl Checkpoint {
 
     fn entry(&self, name: &str) -> Result<&Entry> {
         match self.duplicates.get(name) {
-            Some(problem) => Err(Error::Checkpoint(Problem::new("source", problem))),
+            Some(problem) => bail!(Checkpoint, "source"; "{problem}"),
             None => self
                 .entries
                 .get(name)
@@ -308,9 +308,7 @@ impl Checkpoint {
                 widened.extend(values.map(|bits| f16::from_bits(bits).to_f32()));
                 Ok(Elements::F32(widened))
             }
-            other => Err(Error::Checkpoint(problem!(
-                "source"; "{name} is {other:?}, expected F32, BF16 or F16"
-            ))),
+            other => bail!(Checkpoint, "source"; "{name} is {other:?}, expected F32, BF16 or F16"),
         }
     }
 

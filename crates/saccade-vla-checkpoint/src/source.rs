@@ -5,9 +5,9 @@ use std::io::{Error as IoError, Read, Result as IoResult};
 use std::path::{Path, PathBuf};
 use std::time::SystemTime;
 
+use crate::bail;
 use crate::error::{Error, Result};
 use crate::lfs::pointer_problem;
-use crate::problem;
 
 /// A longer header, index or config is hostile: the released head has 314 tensors in 40 kB.
 pub(crate) const MAX_TEXT_BYTES: u64 = 100_000_000;
@@ -128,6 +128,6 @@ pub fn read_text(what: &'static str, path: &Path) -> Result<String> {
     let text = read().map_err(|error| Error::reading(what, path, error))?;
     match pointer_problem(path, text.as_bytes()) {
         None => Ok(text),
-        Some(problem) => Err(Error::Checkpoint(problem!(what; "{}: {problem}", path.display()))),
+        Some(problem) => bail!(Checkpoint, what; "{}: {problem}", path.display()),
     }
 }

@@ -3,7 +3,7 @@
 
 use saccade_vla_kernels::Rows;
 
-use crate::error::{Error, Result, problem, show_shape};
+use crate::error::{Error, Result, bail, ensure, problem, show_shape};
 
 /// A C-contiguous array: what the public functions take.
 ///
@@ -202,9 +202,7 @@ impl OwnedArray {
 pub(crate) fn check_length(name: &str, len: usize, shape: &[usize]) -> Result<()> {
     match product(shape) {
         Some(elements) if elements == len => Ok(()),
-        _ => Err(Error::Shape(problem!(
-            name; "{} does not fit {len} elements", show_shape(shape)
-        ))),
+        _ => bail!(Shape, name; "{} does not fit {len} elements", show_shape(shape)),
     }
 }
 
@@ -215,12 +213,11 @@ pub(crate) fn product(sizes: &[usize]) -> Option<usize> {
 }
 
 fn check_shape(name: &str, axes: &str, given: &[usize], expected: &[usize]) -> Result<()> {
-    if given == expected {
-        return Ok(());
-    }
-    Err(Error::Shape(problem!(
-        name; expected "{axes} = {}", show_shape(expected); got "{}", show_shape(given)
-    )))
+    ensure!(
+        given == expected, Shape, name;
+        expected "{axes} = {}", show_shape(expected); got "{}", show_shape(given)
+    );
+    Ok(())
 }
 
 /// The error for an element of a result of this shape that is not finite.

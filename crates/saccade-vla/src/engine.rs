@@ -4,7 +4,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 
 use saccade_vla_kernels::{Isa, LinearScratch, MAX_THREADS};
 
-use crate::error::{Error, Result, problem};
+use crate::error::{Error, Result, bail};
 use crate::precision::Precision;
 
 /// The instruction set, threads and precision that a model computes with.
@@ -30,9 +30,7 @@ impl Engine {
         let threads = match num_threads {
             Some(threads) if (1..=MAX_THREADS).contains(&threads) => threads,
             Some(threads) => {
-                return Err(Error::Input(problem!(
-                    "num_threads"; expected "1 to {MAX_THREADS}"; got "{threads}"
-                )));
+                bail!(Input, "num_threads"; expected "1 to {MAX_THREADS}"; got "{threads}");
             }
             None => saccade_vla_kernels::default_num_threads()?.get(),
         };

@@ -3,8 +3,7 @@
 use std::path::Path;
 
 pub use saccade_vla_checkpoint::Problem;
-pub(crate) use saccade_vla_checkpoint::problem;
-pub(crate) use saccade_vla_checkpoint::show_shape;
+pub(crate) use saccade_vla_checkpoint::{bail, ensure, problem, show_shape};
 use saccade_vla_checkpoint::{printable, show_bytes};
 use saccade_vla_kernels::{IsaError, KernelError, NumThreadsError};
 

@@ -6,7 +6,7 @@ use saccade_vla_kernels::{Epilogue, LinearScratch, PackedKeyValues, Rows, RowsMu
 use crate::alloc::{Scratch, collected, filled, product};
 use crate::array::{Array, ArrayMut, first_not_bias};
 use crate::engine::{Engine, Kernels};
-use crate::error::{Error, Problem, Result, problem, show_shape};
+use crate::error::{Error, Result, bail, ensure, problem, show_shape};
 use crate::nn::attention::{Attention, AttentionWorkspace, Bias, CrossKeys};
 use crate::nn::sequences::Sequences;
 use crate::nn::source::memory::{self, MemorySource, TensorViews};
@@ -94,19 +94,16 @@ impl CrossAttention {
         let problems = memory::problems(tensors, &plan(layer(1))?.specs, |_, _| false);
         if !problems.is_empty() {
             let listed = spec::list(&problems, "the widths of to_q and to_k");
-            return Err(Error::Checkpoint(Problem::new("tensors", listed)));
+            bail!(Checkpoint, "tensors"; "{listed}");
         }
-        if width == 0 || context_dim == 0 {
-            return Err(Error::Checkpoint(problem!(
-                "tensors"; expected "at least one input and output feature";
-                got "width {width} and context_dim {context_dim}"
-            )));
-        }
-        if num_heads == 0 || !width.is_multiple_of(num_heads) {
-            return Err(Error::Input(problem!(
-                "num_heads"; expected "a divisor of the width {width}"; got "{num_heads}"
-            )));
-        }
+        ensure!(
+            width > 0 && context_dim > 0, Checkpoint, "tensors";
+            expected "at least one input and output feature"; got "width {width} and context_dim {context_dim}"
+        );
+        ensure!(
+            num_heads > 0 && width.is_multiple_of(num_heads), Input, "num_heads";
+            expected "a divisor of the width {width}"; got "{num_heads}"
+        );
         let source = MemorySource::new(tensors);
         let (attention, nbytes) = weights::build(&source, engine, layer(num_heads))?;
         Ok(Self {
@@ -218,17 +215,14 @@ impl CrossAttention {
     }
 
     fn check_keys(&self, kv: &KeyValues, batch: usize) -> Result<()> {
-        if (kv.num_heads, kv.width) != (self.num_heads, self.width()) {
-            return Err(Error::Input(problem!(
-                "kv"; expected "keys and values of {} heads and width {}", self.num_heads, self.width();
-                got "{} and {}", kv.num_heads, kv.width
-            )));
-        }
-        if batch != kv.batch {
-            return Err(Error::Shape(problem!(
-                "hidden_states"; expected "the batch of kv, {}", kv.batch; got "{batch}"
-            )));
-        }
+        ensure!(
+            (kv.num_heads, kv.width) == (self.num_heads, self.width()), Input, "kv";
+            expected "keys and values of {} heads and width {}", self.num_heads, self.width();
+            got "{} and {}", kv.num_heads, kv.width
+        );
+        ensure!(
+            batch == kv.batch, Shape, "hidden_states"; expected "the batch of kv, {}", kv.batch; got "{batch}"
+        );
         Ok(())
     }
 
@@ -259,9 +253,7 @@ fn logit_bias(
         Some(bias) => {
             bias.check_shape("key_bias", axes, &shape)?;
             if let Some(bad) = first_not_bias(bias.data()) {
-                return Err(Error::Input(problem!(
-                    "key_bias"; expected "finite values or minus infinity"; got "{bad}"
-                )));
+                bail!(Input, "key_bias"; expected "finite values or minus infinity"; got "{bad}");
             }
             collected("key_bias", bias.data().len(), bias.data().iter().copied())?
         }

@@ -7,9 +7,9 @@ use std::path::{Path, PathBuf};
 
 use super::temporary::{TemporaryDirectory, parent_of, unique};
 use crate::companions::OWN_CONFIG;
+use crate::ensure;
 use crate::error::{Error, Result};
 use crate::names::is_processor;
-use crate::problem;
 
 /// What a checkpoint may hold in addition to its weights and companions.
 const OWN_FILES: [&str; 3] = ["config.json", "model.safetensors.index.json", OWN_CONFIG];
@@ -26,11 +26,7 @@ pub(super) fn check_replaceable(out: &Path, companions: &BTreeSet<PathBuf>, forc
         Err(error) => return Err(failed(error)),
         Ok(metadata) => metadata,
     };
-    if !metadata.is_dir() {
-        return Err(Error::Input(problem!(
-            "out"; "{shown} exists and is not a directory"
-        )));
-    }
+    ensure!(metadata.is_dir(), Input, "out"; "{shown} exists and is not a directory");
     let is_empty = std::fs::read_dir(out).map_err(failed)?.next().is_none();
     let mut folders = vec![PathBuf::new()];
     while let Some(folder) = folders.pop() {
@@ -45,20 +41,14 @@ pub(super) fn check_replaceable(out: &Path, companions: &BTreeSet<PathBuf>, forc
             let name = path.to_string_lossy();
             let is_own = folder.as_os_str().is_empty()
                 && (OWN_FILES.contains(&&*name) || name.ends_with(".safetensors") && !is_processor(&name));
-            if !(kind.is_file() && (is_own || companions.contains(&path))) {
-                return Err(Error::Input(problem!(
-                    "out";
-                    "{shown} holds {name}, which is no part of this checkpoint: choose another directory"
-                )));
-            }
+            ensure!(
+                kind.is_file() && (is_own || companions.contains(&path)), Input, "out";
+                "{shown} holds {name}, which is no part of this checkpoint: choose another directory"
+            );
         }
     }
-    if is_empty || force {
-        return Ok(true);
-    }
-    Err(Error::Input(problem!(
-        "out"; "{shown} exists already; force replaces it"
-    )))
+    ensure!(is_empty || force, Input, "out"; "{shown} exists already; force replaces it");
+    Ok(true)
 }
 
 /// What the file system does with names. Tests put other programs in between.

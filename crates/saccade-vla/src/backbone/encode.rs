@@ -14,7 +14,7 @@ use super::token_positions::{rope_pairs, token_positions};
 use crate::alloc::{collected, filled, product, reserve, reserved};
 use crate::array::{Array, OwnedArray};
 use crate::engine::Kernels;
-use crate::error::{Error, Result, problem};
+use crate::error::{Error, Result, ensure};
 use crate::nn::kv_cache;
 use crate::nn::rope::Rope;
 
@@ -92,11 +92,10 @@ impl Backbone {
         previous: &[&BackboneFeatures],
         keep: BackboneKeep,
     ) -> Result<Vec<BackboneFeatures>> {
-        if previous.iter().any(|features| features.backbone != self.id) {
-            return Err(Error::Input(problem!(
-                "previous"; expected "features that this backbone made"; got "those of another backbone"
-            )));
-        }
+        ensure!(
+            !previous.iter().any(|features| features.backbone != self.id), Input, "previous";
+            expected "features that this backbone made"; got "those of another backbone"
+        );
         let previous = if keep == BackboneKeep::default() {
             previous
         } else {

@@ -5,7 +5,7 @@ use std::borrow::Cow;
 use super::features::BackboneFeatures;
 use crate::alloc::{filled, product, reserved};
 use crate::array::{Array, OwnedArray};
-use crate::error::{Error, Problem, Result};
+use crate::error::{Error, Result, bail};
 use crate::head::encode::Features;
 
 /// Features of prompts of any lengths as one batch for an action head.
@@ -30,11 +30,7 @@ impl<'a> FeatureBatch<'a> {
         const WHAT: &str = "backbone_features";
         let width = all.first().map_or(0, |features| features.feature_dim());
         if let Some(other) = all.iter().find(|features| features.feature_dim() != width) {
-            return Err(Error::Shape(Problem::expected(
-                WHAT,
-                "features of one width",
-                format!("{width} and {}", other.feature_dim()),
-            )));
+            bail!(Shape, WHAT; expected "features of one width"; got "{width} and {}", other.feature_dim());
         }
         let count = all.iter().map(|features| features.batch()).sum();
         let longest = all

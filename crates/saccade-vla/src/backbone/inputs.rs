@@ -5,7 +5,7 @@ use std::ops::Range;
 use super::config::{BackboneConfig, CHANNELS, Tower, VisionConfig};
 use crate::alloc::{collected, filled, reserve, reserved};
 use crate::array::{Array, unravel};
-use crate::error::{Error, Result, problem, show_shape};
+use crate::error::{Error, Result, bail, ensure, problem, show_shape};
 
 /// The inputs of [`Backbone::encode`](super::model::Backbone::encode), as the released processors prepare
 /// them.
@@ -76,10 +76,10 @@ impl<'a> Checked<'a> {
         let (batch, num_tokens) = match *inputs.input_ids.shape() {
             [batch, tokens] if batch > 0 && tokens > 0 => (batch, tokens),
             ref other => {
-                return Err(Error::Shape(problem!(
-                    "input_ids"; expected "(batch, tokens) with at least one prompt and token";
-                    got "{}", show_shape(other)
-                )));
+                bail!(
+                    Shape, "input_ids";
+                    expected "(batch, tokens) with at least one prompt and token"; got "{}", show_shape(other)
+                );
             }
         };
         if let Some(mask) = inputs.attention_mask {
@@ -115,12 +115,11 @@ impl<'a> Checked<'a> {
             });
             first = end;
         }
-        if first < views.len() {
-            return Err(Error::Input(problem!(
-                "pixel_values"; "{} views were given, but the prompts have image tokens (id {}) for {first}",
-                views.len(), config.image_token_id
-            )));
-        }
+        ensure!(
+            first >= views.len(), Input, "pixel_values";
+            "{} views were given, but the prompts have image tokens (id {}) for {first}",
+            views.len(), config.image_token_id
+        );
         Ok(Self {
             views,
             prompts,
@@ -228,9 +227,7 @@ fn images<'a>(config: &VisionConfig, inputs: &BackboneInputs<'a>) -> Result<Vec<
                 Some(size) => format!("(views, {CHANNELS}, {size}, {size})"),
                 None => format!("(views, {CHANNELS}, height, width) with sides that are multiples of {unit}"),
             };
-            return Err(Error::Shape(problem!(
-                name(index, several); expected "{sides}"; got "{}", show_shape(array.shape())
-            )));
+            bail!(Shape, name(index, several); expected "{sides}"; got "{}", show_shape(array.shape()));
         }
         let (height, width) = (array.shape()[2], array.shape()[3]);
         let of_array = array.data().chunks_exact(CHANNELS * height * width);
@@ -254,21 +251,19 @@ fn patches<'a>(
     grid: Array<'a, i64>,
 ) -> Result<Vec<ViewPixels<'a>>> {
     let [array] = pixel_values else {
-        return Err(Error::Shape(problem!(
-            "pixel_values"; expected "one array of patches"; got "{}", pixel_values.len()
-        )));
+        bail!(Shape, "pixel_values"; expected "one array of patches"; got "{}", pixel_values.len());
     };
     let (&[num_patches, width], &[_, 3]) = (array.shape(), grid.shape()) else {
-        return Err(Error::Shape(problem!(
-            "pixel_values, image_grid_thw"; expected "(patches, {patch_elements}) and (views, 3)";
+        bail!(
+            Shape, "pixel_values, image_grid_thw";
+            expected "(patches, {patch_elements}) and (views, 3)";
             got "{} and {}", show_shape(array.shape()), show_shape(grid.shape())
-        )));
+        );
     };
-    if width != patch_elements {
-        return Err(Error::Shape(problem!(
-            "pixel_values"; expected "(patches, {patch_elements})"; got "{}", show_shape(array.shape())
-        )));
-    }
+    ensure!(
+        width == patch_elements, Shape, "pixel_values";
+        expected "(patches, {patch_elements})"; got "{}", show_shape(array.shape())
+    );
     let mut views = reserved("views", grid.shape()[0])?;
     let mut left = array.data();
     for (index, sizes) in grid.data().chunks_exact(3).enumerate() {
@@ -277,10 +272,11 @@ fn patches<'a>(
             (side > 0 && side.is_multiple_of(config.merge)).then_some(side)
         };
         let (1, Some(rows), Some(columns)) = (sizes[0], side(sizes[1]), side(sizes[2])) else {
-            return Err(Error::Input(problem!(
-                "image_grid_thw"; expected "(1, rows, columns) with multiples of {}", config.merge;
+            bail!(
+                Input, "image_grid_thw";
+                expected "(1, rows, columns) with multiples of {}", config.merge;
                 got "({}, {}, {}) for view {index}", sizes[0], sizes[1], sizes[2]
-            )));
+            );
         };
         let len = rows
             .checked_mul(columns)

@@ -4,7 +4,7 @@ use saccade_vla_checkpoint::spec::{self, TensorProblem};
 
 use super::config::BackboneConfig;
 use super::json::GivenConfig;
-use crate::error::{Error, Result, problem};
+use crate::error::{Error, Result, bail, problem};
 use crate::recognise::BACKBONE_PREFIXES;
 use crate::release::{BackboneRules, Names, Version};
 
@@ -37,17 +37,16 @@ impl Recognised {
             [first, second, ..] => {
                 let show =
                     |(prefix, version, _): (&str, Version, _)| format!("of GR00T {version} under `{prefix}`");
-                return Err(Error::Checkpoint(problem!(
-                    "source"; "two backbones in one checkpoint, {} and {}", show(first), show(second)
-                )));
+                bail!(
+                    Checkpoint, "source";
+                    "two backbones in one checkpoint, {} and {}", show(first), show(second)
+                );
             }
         };
         if let Some((other, words)) = given.version()?
             && other != version
         {
-            return Err(Error::Checkpoint(problem!(
-                "config"; "{words}, but the tensors are those of GR00T {version}"
-            )));
+            bail!(Checkpoint, "config"; "{words}, but the tensors are those of GR00T {version}");
         }
         let config = given.read(version, rules)?;
         let own = format!("{}.embed_tokens", rules.names.language);

@@ -5,7 +5,7 @@
 use super::config::BackboneConfig;
 use super::inputs::{Prompt, ViewPixels};
 use crate::alloc::{collected, filled};
-use crate::error::{Error, Result, problem};
+use crate::error::{Error, Result, ensure};
 use crate::nn::rope::{RopePair, one_axis};
 
 /// The rotation of the pairs of the language model's heads: all by the place in the prompt, or interleaved by
@@ -56,13 +56,11 @@ pub(super) fn token_positions(
         let [rows, columns] = view.grid.map(|side| side / config.vision.merge);
         let tokens = place..place + rows * columns;
         let is_whole = |token| prompt.attended[token] && prompt.ids[token] == config.image_token_id as i64;
-        if tokens.end > count || !tokens.clone().all(is_whole) {
-            return Err(Error::Input(problem!(
-                "input_ids";
-                expected "the {} tokens of a view one after the other and attended", tokens.len();
-                got "others from token {place} on"
-            )));
-        }
+        ensure!(
+            tokens.end <= count && tokens.clone().all(is_whole), Input, "input_ids";
+            expected "the {} tokens of a view one after the other and attended", tokens.len();
+            got "others from token {place} on"
+        );
         for (index, token) in tokens.clone().enumerate() {
             positions[token] = [next, next + index / columns, next + index % columns];
         }

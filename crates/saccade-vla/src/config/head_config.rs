@@ -4,7 +4,7 @@
 //! [`HeadConfig`] have the names that are used everywhere else.
 
 use super::values::MAX_SIZE;
-use crate::error::{Error, Result, problem};
+use crate::error::{Error, Result, ensure};
 use crate::release::{Feature, Version};
 
 /// The sizes and switches of an action head.
@@ -116,11 +116,10 @@ impl HeadConfig {
             ),
             false => (MAX_SIZE as usize, ""),
         };
-        if !(1..=limit).contains(&action_horizon) {
-            return Err(Error::Input(problem!(
-                "action_horizon"; expected "1 to {limit}{what}"; got "{action_horizon}"
-            )));
-        }
+        ensure!(
+            (1..=limit).contains(&action_horizon), Input, "action_horizon";
+            expected "1 to {limit}{what}"; got "{action_horizon}"
+        );
         Ok(Self {
             action_horizon,
             ..self
@@ -133,19 +132,17 @@ impl HeadConfig {
     /// [`Error::Input`] for none, for more than any config may ask for, and for a version that makes one row
     /// of as many states as its config says, for another number.
     pub fn with_num_states(self, num_states: usize) -> Result<Self> {
-        if self.version.has(Feature::StateHistory) && num_states != self.state_history {
-            return Err(Error::Input(problem!(
-                "num_states";
-                expected "{}, since {} makes one row of its last states (state_history_length)",
-                self.state_history, self.version;
-                got "{num_states}"
-            )));
-        }
-        if !(1..=MAX_SIZE as usize).contains(&num_states) {
-            return Err(Error::Input(problem!(
-                "num_states"; expected "1 to {MAX_SIZE}"; got "{num_states}"
-            )));
-        }
+        ensure!(
+            !self.version.has(Feature::StateHistory) || num_states == self.state_history,
+            Input, "num_states";
+            expected "{}, since {} makes one row of its last states (state_history_length)",
+            self.state_history, self.version;
+            got "{num_states}"
+        );
+        ensure!(
+            (1..=MAX_SIZE as usize).contains(&num_states), Input, "num_states";
+            expected "1 to {MAX_SIZE}"; got "{num_states}"
+        );
         Ok(Self { num_states, ..self })
     }
 

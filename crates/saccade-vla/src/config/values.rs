@@ -7,7 +7,7 @@ use std::path::Path;
 use saccade_vla_checkpoint::read_text;
 use serde_json::{Map, Value};
 
-use crate::error::{Error, Problem, Result, problem};
+use crate::error::{Error, Problem, Result, bail};
 
 /// A JSON object.
 pub(crate) type Object = Map<String, Value>;
@@ -25,10 +25,7 @@ pub(crate) const MAX_LAYERS: u64 = 1024;
 pub(crate) fn config_object(text: &str) -> Result<Object> {
     match serde_json::from_str(text) {
         Ok(Value::Object(object)) => Ok(object),
-        Ok(_) => Err(Error::Checkpoint(Problem::new(
-            "config",
-            "expected a JSON object",
-        ))),
+        Ok(_) => bail!(Checkpoint, "config"; "expected a JSON object"),
         Err(source) => Err(Error::json("config", source)),
     }
 }
@@ -40,9 +37,7 @@ pub(crate) fn config_object(text: &str) -> Result<Object> {
 pub(crate) fn object_in(what: &'static str, path: &Path) -> Result<Object> {
     match serde_json::from_str(&read_text(what, path)?) {
         Ok(Value::Object(object)) => Ok(object),
-        Ok(_) => Err(Error::Checkpoint(problem!(
-            what; "{}: expected a JSON object", path.display()
-        ))),
+        Ok(_) => bail!(Checkpoint, what; "{}: expected a JSON object", path.display()),
         Err(source) => Err(Error::json(format!("{what}: {}", path.display()), source)),
     }
 }

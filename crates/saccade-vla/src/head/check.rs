@@ -5,19 +5,18 @@ use super::context::Context;
 use super::sample::Sampling;
 use crate::alloc::reserve;
 use crate::array::{Array, ArrayMut};
-use crate::error::{Error, Problem, Result, problem, show_shape};
+use crate::error::{Error, Problem, Result, bail, ensure, problem, show_shape};
 use crate::inspect::call_sizes::CallSizes;
 use crate::inspect::intervention::Intervention;
 use crate::sampling::chunking::Seam;
 
 impl ActionHead {
     pub(super) fn check_context(&self, context: &Context) -> Result<()> {
-        if context.head == self.id {
-            return Ok(());
-        }
-        Err(Error::Input(problem!(
-            "context"; expected "one that this head encoded"; got "that of another head"
-        )))
+        ensure!(
+            context.head == self.id, Input, "context";
+            expected "one that this head encoded"; got "that of another head"
+        );
+        Ok(())
     }
 
     pub(super) fn check_state<'a>(&self, state: Array<'a>, batch: usize) -> Result<&'a [f32]> {
@@ -31,12 +30,12 @@ impl ActionHead {
                 ),
                 _ => format!("the last {count} states, (batch, num_states, state_dim)"),
             };
-            return Err(Error::Shape(problem!(
-                "state";
+            bail!(
+                Shape, "state";
                 expected "{axes} = {}, normalised and zero-padded to state_dim as the checkpoint's normaliser does",
                 show_shape(&[batch, count, width]);
                 got "{}", show_shape(state.shape())
-            )));
+            );
         }
         Ok(state.check_finite("state")?.data())
     }
@@ -44,12 +43,11 @@ impl ActionHead {
     pub(super) fn check_num_steps(&self, num_steps: Option<usize>) -> Result<usize> {
         let num_steps = num_steps.unwrap_or(self.config.num_steps);
         let buckets = self.config.num_timestep_buckets;
-        if (1..=buckets).contains(&num_steps) {
-            return Ok(num_steps);
-        }
-        Err(Error::Input(problem!(
-            "num_steps"; expected "1 to {buckets} (num_timestep_buckets)"; got "{num_steps}"
-        )))
+        ensure!(
+            (1..=buckets).contains(&num_steps), Input, "num_steps";
+            expected "1 to {buckets} (num_timestep_buckets)"; got "{num_steps}"
+        );
+        Ok(num_steps)
     }
 
     /// Checks the noise; returns the number of samples per observation.

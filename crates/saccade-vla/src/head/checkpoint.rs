@@ -7,7 +7,7 @@ use super::embodiments::Embodiments;
 use super::layers::HeadLayers;
 use super::plan::{is_unused, specs_of};
 use crate::engine::Engine;
-use crate::error::{Error, Problem, Result};
+use crate::error::{Error, Result, ensure};
 use crate::nn::source::sizer::nbytes;
 use crate::precision::Precision;
 use crate::recognise::HeadCheckpoint;
@@ -22,11 +22,8 @@ impl HeadCheckpoint {
         let is_unused = |name: &str, shape: &[usize]| is_unused(&self.config, name, shape);
         let expected = specs_of(&self.config, |name| self.has(name))?;
         let problems = self.checkpoint.problems(self.prefix, &expected, is_unused);
-        if problems.is_empty() {
-            return Ok(());
-        }
-        let listed = spec::list(&problems, "the config");
-        Err(Error::Checkpoint(Problem::new("source", listed)))
+        ensure!(problems.is_empty(), Checkpoint, "source"; "{}", spec::list(&problems, "the config"));
+        Ok(())
     }
 
     /// True if the head has a tensor `name`, without the prefix.

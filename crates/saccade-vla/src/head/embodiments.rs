@@ -1,6 +1,6 @@
 //! The embodiments of a head: how many there are, and which are loaded.
 
-use crate::error::{Error, Problem, Result, problem};
+use crate::error::{Error, Result, bail, ensure};
 
 /// The embodiments of a checkpoint, of which some are in use.
 #[derive(Clone, Copy)]
@@ -37,16 +37,12 @@ pub(crate) fn chosen_embodiments(
                         format!("some of {}, which alone are in this checkpoint", kept.join(", "))
                     }
                 };
-                return Err(Error::Input(Problem::expected("embodiment_ids", expected, id)));
+                bail!(Input, "embodiment_ids"; expected "{expected}"; got "{id}");
             }
         }
     }
     chosen.sort_unstable();
     chosen.dedup();
-    if chosen.is_empty() {
-        return Err(Error::Input(problem!(
-            "embodiment_ids"; expected "at least one id"; got "none"
-        )));
-    }
+    ensure!(!chosen.is_empty(), Input, "embodiment_ids"; expected "at least one id"; got "none");
     Ok(chosen)
 }

@@ -9,7 +9,7 @@ use crate::alloc::{collected, reserved};
 use crate::array::Array;
 use crate::config::Reads;
 use crate::engine::Kernels;
-use crate::error::{Error, Result, problem, show_shape};
+use crate::error::{Error, Result, bail, ensure, show_shape};
 use crate::inspect::trace::Keep;
 
 /// The observation given to [`ActionHead::encode`].
@@ -124,11 +124,11 @@ impl ActionHead {
         let (batch, num_vl_tokens) = match *array.shape() {
             [batch, tokens, width] if width == context_dim && batch > 0 && tokens > 0 => (batch, tokens),
             _ => {
-                return Err(Error::Shape(problem!(
-                    "backbone_features";
+                bail!(
+                    Shape, "backbone_features";
                     expected "(batch, num_vl_tokens, {context_dim}) with at least one observation and token";
                     got "{}", show_shape(array.shape())
-                )));
+                );
             }
         };
         array.check_finite("backbone_features")?;
@@ -143,26 +143,19 @@ impl ActionHead {
             }
         }
         let ignores_masks = self.config.attend_text_every_n_blocks == 0;
-        if ignores_masks
-            && features
-                .attention_mask
-                .is_some_and(|mask| mask.data().contains(&false))
-        {
-            return Err(Error::Input(problem!(
-                "attention_mask";
-                "expected no false entry, since this head (GR00T {}) ignores padding masks: leave the mask out to attend to \
-                 padding as the released code does, or give its complement as drop_vl to remove these positions",
-                self.config.version
-            )));
-        }
-        if !ignores_masks && features.image_mask.is_none() {
-            return Err(Error::Input(problem!(
-                "image_mask";
-                expected "(batch, num_vl_tokens) booleans, true for image tokens, since this head's blocks alternate between \
-                 text and images";
-                got "none"
-            )));
-        }
+        ensure!(
+            !(ignores_masks && features.attention_mask.is_some_and(|mask| mask.data().contains(&false))),
+            Input, "attention_mask";
+            "expected no false entry, since this head (GR00T {}) ignores padding masks: leave the mask out to attend to \
+             padding as the released code does, or give its complement as drop_vl to remove these positions",
+             self.config.version
+        );
+        ensure!(
+            ignores_masks || features.image_mask.is_some(), Input, "image_mask";
+            expected "(batch, num_vl_tokens) booleans, true for image tokens, since this head's blocks alternate between \
+             text and images";
+            got "none"
+        );
         Ok((batch, num_vl_tokens))
     }
 
@@ -193,12 +186,12 @@ impl ActionHead {
                     Reads::Images => ("image", "true"),
                     _ => ("text", "false"),
                 };
-                return Err(Error::Input(problem!(
-                    "image_mask";
+                bail!(
+                    Input, "image_mask";
                     expected "at least one {kind} token ({what}) in each observation that is attended and not dropped, since some \
                      of this head's blocks see nothing else";
                     got "none in observation {element}"
-                )));
+                );
             }
             seen.push(Seen { reads, positions });
         }

@@ -8,7 +8,7 @@ use super::action_head::ActionHead;
 use super::context::Context;
 use super::dit::Pass;
 use super::workspace::Workspace;
-use crate::error::{Error, Result, problem};
+use crate::error::{Error, Result, ensure, problem};
 use crate::inspect::compiled::CompiledInterventions;
 use crate::inspect::intervention::Intervention;
 use crate::inspect::trace::Recorded;
@@ -75,21 +75,18 @@ impl ActionHead {
         };
         let rounded = weight as f32;
         // Of the number that was given: a small one below 0 is rounded to -0, which is at least 0.
-        if !(rounded.is_finite() && weight >= 0.0) {
-            return Err(Error::Input(problem!(
-                "guidance"; expected "a finite number of at least 0"; got "{weight}"
-            )));
-        }
-        if without.head != self.id {
-            return Err(Error::Input(problem!(
-                "without"; expected "a context that this head encoded"; got "that of another head"
-            )));
-        }
-        if without.batch != batch {
-            return Err(Error::Input(problem!(
-                "without"; expected "a context of {batch} observations, as the first one is"; got "{}", without.batch
-            )));
-        }
+        ensure!(
+            rounded.is_finite() && weight >= 0.0, Input, "guidance";
+            expected "a finite number of at least 0"; got "{weight}"
+        );
+        ensure!(
+            without.head == self.id, Input, "without";
+            expected "a context that this head encoded"; got "that of another head"
+        );
+        ensure!(
+            without.batch == batch, Input, "without";
+            expected "a context of {batch} observations, as the first one is"; got "{}", without.batch
+        );
         if rounded == 1.0 {
             return Ok(None);
         }

@@ -6,7 +6,7 @@ use super::dit::{ActiveRows, Pass};
 use super::flow_matching::Steps;
 use super::guidance::Guidance;
 use crate::array::{Array, ArrayMut};
-use crate::error::{Error, Result, problem};
+use crate::error::{Error, Result, bail};
 use crate::inspect::compiled::CompiledInterventions;
 use crate::inspect::intervention::Intervention;
 use crate::inspect::trace::Recorded;
@@ -118,9 +118,7 @@ impl ActionHead {
 /// The number of evaluations from one that runs all rows to the next.
 pub(super) fn check_refresh(future_refresh: Option<usize>) -> Result<usize> {
     match future_refresh {
-        Some(0) => Err(Error::Input(problem!(
-            "future_refresh"; expected "at least 1"; got "0"
-        ))),
+        Some(0) => bail!(Input, "future_refresh"; expected "at least 1"; got "0"),
         given => Ok(given.unwrap_or(1)),
     }
 }

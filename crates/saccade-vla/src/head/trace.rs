@@ -7,7 +7,7 @@ use super::flow_matching::Steps;
 use super::sample::Sampling;
 use crate::alloc::filled;
 use crate::array::{Array, OwnedArray};
-use crate::error::{Error, Result, problem};
+use crate::error::{Error, Result, bail, ensure};
 use crate::inspect::compiled::CompiledInterventions;
 use crate::inspect::groups::Groups;
 use crate::inspect::trace::{Recorded, Shapes, StepBlock, Trace, TraceOptions};
@@ -107,24 +107,23 @@ impl ActionHead {
 /// Checks that a trace can be made of a call with these options.
 fn check_traceable(sampling: &Sampling<'_>) -> Result<()> {
     if let Some(samples) = sampling.num_samples {
-        return Err(Error::Input(problem!(
-            "num_samples"; expected "none, since a trace is of one chunk an observation"; got "{samples}"
-        )));
+        bail!(
+            Input, "num_samples";
+            expected "none, since a trace is of one chunk an observation"; got "{samples}"
+        );
     }
-    if sampling.integrator != Integrator::Euler {
-        return Err(Error::Input(problem!(
-            "integrator"; expected "euler, since a trace has one evaluation a step"; got "midpoint"
-        )));
-    }
-    if sampling.guidance.is_some() {
-        return Err(Error::Input(problem!(
-            "guidance"; "expected none, since a trace is of one context"
-        )));
-    }
+    ensure!(
+        sampling.integrator == Integrator::Euler, Input, "integrator";
+        expected "euler, since a trace has one evaluation a step"; got "midpoint"
+    );
+    ensure!(
+        sampling.guidance.is_none(), Input, "guidance"; "expected none, since a trace is of one context"
+    );
     if let Some(refresh) = sampling.future_refresh {
-        return Err(Error::Input(problem!(
-            "future_refresh"; expected "none, since a trace is of all rows at every step"; got "{refresh}"
-        )));
+        bail!(
+            Input, "future_refresh";
+            expected "none, since a trace is of all rows at every step"; got "{refresh}"
+        );
     }
     Ok(())
 }

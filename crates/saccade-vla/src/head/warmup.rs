@@ -6,7 +6,7 @@ use super::sample::{Sampling, check_refresh};
 use crate::alloc::{collected, filled, product};
 use crate::array::{Array, ArrayMut};
 use crate::config::Reads;
-use crate::error::{Error, Problem, Result, problem};
+use crate::error::{Error, Result, ensure, problem};
 use crate::sampling::timestep::timestep;
 
 /// Elements of tokens and rows that a warm-up may ask for: 8 GB in float32, far above any batch that a CPU is
@@ -31,18 +31,14 @@ impl ActionHead {
             ("batch", batch),
             ("num_samples", num_samples.unwrap_or(1)),
         ] {
-            if size == 0 {
-                return Err(Error::Input(Problem::expected(name, "at least 1", "0")));
-            }
+            ensure!(size != 0, Input, name; expected "at least 1"; got "0");
         }
         self.check_warmup(num_vl_tokens, batch, num_samples.unwrap_or(1))?;
         let kinds = self.kinds();
-        if kinds.len() > num_vl_tokens {
-            return Err(Error::Input(problem!(
-                "num_vl_tokens"; expected "at least 2, one of text and one of an image";
-                got "{num_vl_tokens}"
-            )));
-        }
+        ensure!(
+            kinds.len() <= num_vl_tokens, Input, "num_vl_tokens";
+            expected "at least 2, one of text and one of an image"; got "{num_vl_tokens}"
+        );
         let config = &self.config;
         let sizes = [batch, num_vl_tokens, config.context_dim];
         let features = filled("features", product("features", &sizes)?, 0.0)?;

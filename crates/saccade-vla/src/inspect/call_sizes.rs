@@ -3,7 +3,7 @@
 use super::groups::Groups;
 use super::intervention::Intervention;
 use crate::config::HeadConfig;
-use crate::error::{Error, Result, problem, show_shape};
+use crate::error::{Error, Result, ensure, show_shape};
 
 /// The sizes of one call.
 #[derive(Clone, Copy)]
@@ -56,16 +56,13 @@ fn replaced_future_tokens(interventions: &[Intervention], width: usize) -> Resul
     let Some(tokens) = given.next() else {
         return Ok(None);
     };
-    if given.next().is_some() {
-        return Err(Error::Input(problem!(
-            "future_tokens"; expected "at most one intervention that replaces them"; got "several"
-        )));
-    }
-    if tokens.shape().len() != 2 || tokens.shape()[1] != width {
-        return Err(Error::Shape(problem!(
-            "future_tokens"; expected "(tokens, width) with width {width}";
-            got "{}", show_shape(tokens.shape())
-        )));
-    }
+    ensure!(
+        given.next().is_none(), Input, "future_tokens";
+        expected "at most one intervention that replaces them"; got "several"
+    );
+    ensure!(
+        matches!(*tokens.shape(), [_, last] if last == width), Shape, "future_tokens";
+        expected "(tokens, width) with width {width}"; got "{}", show_shape(tokens.shape())
+    );
     Ok(Some(tokens.view().check_finite("future_tokens")?.data()))
 }

@@ -5,7 +5,7 @@ use super::groups::{Group, Tokens, check_indices};
 use super::intervention::Intervention;
 use crate::array::first_not_bias;
 use crate::config::HeadConfig;
-use crate::error::{Error, Result, problem, show_shape};
+use crate::error::{Error, Result, bail, ensure, problem, show_shape};
 
 /// That cuts and biases fit the call, and that each of them acts somewhere.
 ///
@@ -21,20 +21,15 @@ pub(super) fn check(intervention: &Intervention, sizes: &CallSizes<'_>) -> Resul
         let Some(indices) = indices else {
             continue;
         };
-        if indices.is_empty() {
-            return Err(Error::Input(problem!(
-                name; expected "at least one index"; got "an empty list"
-            )));
-        }
+        ensure!(!indices.is_empty(), Input, name; expected "at least one index"; got "an empty list");
         check_indices(name, indices, count)?;
     }
     let blocks = intervention.blocks.as_deref();
     for (reader, source) in &intervention.cut {
-        if reader.group == Group::Vl {
-            return Err(Error::Input(problem!(
-                "cut"; "vl is read, it does not read; expected a reader among state, future, action"
-            )));
-        }
+        ensure!(
+            reader.group != Group::Vl, Input, "cut";
+            "vl is read, it does not read; expected a reader among state, future, action"
+        );
         for tokens in [reader, source] {
             check_not_empty("cut", tokens, groups.check("cut", tokens)?)?;
         }
@@ -46,16 +41,12 @@ pub(super) fn check(intervention: &Intervention, sizes: &CallSizes<'_>) -> Resul
         check_not_empty("key_bias", tokens, count)?;
         let keys = format!("{} is read", tokens.group.name());
         check_acts("key_bias", &keys, tokens.group, blocks, config)?;
-        if !bias.shape().is_empty() && bias.shape() != [count] {
-            return Err(Error::Shape(problem!(
-                "key_bias"; expected "a number or ({count},) for {}", tokens.group.name();
-                got "{}", show_shape(bias.shape())
-            )));
-        }
+        ensure!(
+            bias.shape().is_empty() || bias.shape() == [count], Shape, "key_bias";
+            expected "a number or ({count},) for {}", tokens.group.name(); got "{}", show_shape(bias.shape())
+        );
         if let Some(bad) = first_not_bias(bias.data()) {
-            return Err(Error::Input(problem!(
-                "key_bias"; expected "numbers below infinity"; got "{bad}"
-            )));
+            bail!(Input, "key_bias"; expected "numbers below infinity"; got "{bad}");
         }
     }
     Ok(())
@@ -84,11 +75,10 @@ fn check_acts(
     let has_edge = |block: &usize| config.is_cross(*block) == is_of_vl;
     let kind = if is_of_vl { "cross" } else { "self" };
     let existing: Vec<usize> = (0..config.num_layers).filter(has_edge).collect();
-    if existing.is_empty() {
-        return Err(Error::Input(problem!(
-            argument; "{edge} in {kind}-attention blocks only, and this head has none"
-        )));
-    }
+    ensure!(
+        !existing.is_empty(), Input, argument;
+        "{edge} in {kind}-attention blocks only, and this head has none"
+    );
     match blocks {
         Some(blocks) if !blocks.iter().any(has_edge) => Err(Error::Input(problem!(
             argument;

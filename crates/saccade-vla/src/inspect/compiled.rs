@@ -11,7 +11,7 @@ use super::groups::{Group, Groups, check_indices};
 use super::intervention::{Intervention, Patch};
 use crate::alloc::{filled, product, reserve};
 use crate::array::first_not_bias;
-use crate::error::{Error, Result, problem, show_shape};
+use crate::error::{Error, Result, bail, ensure, problem, show_shape};
 
 /// All interventions of one call, in the form in which blocks use them.
 pub(crate) struct CompiledInterventions<'a> {
@@ -132,13 +132,11 @@ impl<'a> CompiledInterventions<'a> {
         let heads = if everywhere { 1 } else { config.num_heads };
         let held: usize = self.biases.iter().map(|bias| bias.values.len()).sum();
         let bytes = 4 * (held as u128 + heads as u128 * rows as u128 * keys as u128);
-        if bytes > MAX_BIAS_BYTES {
-            return Err(Error::Input(problem!(
-                "intervention";
-                "cuts and biases over {heads} heads, {rows} rows and {keys} keys need {bytes} bytes, expected at most \
-                 {MAX_BIAS_BYTES}; give fewer of them heads, blocks or steps of their own"
-            )));
-        }
+        ensure!(
+            bytes <= MAX_BIAS_BYTES, Input, "intervention";
+            "cuts and biases over {heads} heads, {rows} rows and {keys} keys need {bytes} bytes, expected at most \
+             {MAX_BIAS_BYTES}; give fewer of them heads, blocks or steps of their own"
+        );
         let mut bias = DenseBias {
             values: filled("intervention", heads * rows * keys, 0.0)?,
             heads,
@@ -154,11 +152,10 @@ impl<'a> CompiledInterventions<'a> {
             bias.add(intervention, &groups, is_cross);
         }
         // Each is below infinity; a sum of several may still reach it.
-        if first_not_bias(&bias.values).is_some() {
-            return Err(Error::Input(problem!(
-                "key_bias"; "expected biases whose sum for a key is below infinity"
-            )));
-        }
+        ensure!(
+            first_not_bias(&bias.values).is_none(), Input, "key_bias";
+            "expected biases whose sum for a key is below infinity"
+        );
         Ok(bias)
     }
 
@@ -254,11 +251,10 @@ impl<'a> PatchedRows<'a> {
         let width = config.width;
         check_indices("patch: step", &[patch.step], sizes.num_steps)?;
         check_indices("patch: block", &[patch.block], config.num_layers)?;
-        if patch.tokens.group == Group::Vl {
-            return Err(Error::Input(problem!(
-                "patch"; "blocks change rows, not vl; expected state, future or action"
-            )));
-        }
+        ensure!(
+            patch.tokens.group != Group::Vl, Input, "patch";
+            "blocks change rows, not vl; expected state, future or action"
+        );
         let name = format!("patch[({}, {})]", patch.step, patch.block);
         let count = groups.check(&name, &patch.tokens)?;
         check_not_empty(&name, &patch.tokens, count)?;
@@ -266,12 +262,12 @@ impl<'a> PatchedRows<'a> {
             shape if shape == [count, width] => 0,
             shape if shape == [sizes.batch, count, width] => count * width,
             shape => {
-                return Err(Error::Shape(problem!(
-                    name;
+                bail!(
+                    Shape, name;
                     expected "(tokens, width) = {} or (batch, tokens, width) = {} for {}",
                     show_shape(&[count, width]), show_shape(&[sizes.batch, count, width]), patch.tokens.group.name();
                     got "{}", show_shape(shape)
-                )));
+                );
             }
         };
         Ok(Self {

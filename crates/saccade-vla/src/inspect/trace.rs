@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use super::groups::{Groups, check_indices};
 use crate::alloc::reserve;
 use crate::array::OwnedArray;
-use crate::error::{Error, Result, problem};
+use crate::error::{Error, Result, ensure};
 use crate::ops::check_interrupted;
 
 /// What to keep.
@@ -75,12 +75,10 @@ impl<Key: Ord + Copy> Recorded<Key> {
                 + u128::from(record.hidden) * bytes(&shapes.hidden)
         };
         let needed: u128 = keys.iter().map(|(_, shapes)| of_key(shapes)).sum();
-        if needed > u128::from(max_bytes) {
-            return Err(Error::Input(problem!(
-                argument;
-                "what is to be recorded takes {needed} bytes, expected at most {max_bytes}; record less at a time"
-            )));
-        }
+        ensure!(
+            needed <= u128::from(max_bytes), Input, argument;
+            "what is to be recorded takes {needed} bytes, expected at most {max_bytes}; record less at a time"
+        );
         // All is reserved before any of it is touched: what does not fit is refused at once.
         let reserved = |shape: &[usize]| {
             let mut data: Vec<f32> = Vec::new();

@@ -6,7 +6,7 @@ use std::sync::Arc;
 
 use crate::array::{Array, ArrayMut};
 use crate::backbone::{Backbone, BackboneFeatures, BackboneInputs, BackboneKeep, FeatureBatch};
-use crate::error::{Error, Problem, Result};
+use crate::error::{Error, Result, ensure};
 use crate::head::action_head::ActionHead;
 use crate::head::context::Context;
 use crate::head::sample::Sampling;
@@ -96,13 +96,7 @@ impl Policy {
         observations: &[Observation<'_>],
         previous: Option<&PolicyContext>,
     ) -> Result<PolicyContext> {
-        if observations.is_empty() {
-            return Err(Error::Input(Problem::expected(
-                "observations",
-                "at least one",
-                "none",
-            )));
-        }
+        ensure!(!observations.is_empty(), Input, "observations"; expected "at least one"; got "none");
         let previous = previous.into_iter().flat_map(|previous| &previous.features);
         let previous: Vec<&BackboneFeatures> = previous.map(|features| &**features).collect();
         let features = {

@@ -7,7 +7,7 @@ use serde_json::{Value, json};
 use super::options::is_read;
 use super::settings::{LEROBOT_CROP, LEROBOT_TARGET};
 use crate::config::{Object, asks_for_nothing, object_in_any};
-use crate::error::{Error, Result, problem};
+use crate::error::{Error, Result, ensure, problem};
 use crate::release::{IsaacFile, LerobotRules, PIXEL_LIMITS, Preprocessing, ProcessorRules, Version};
 
 const PROCESSOR: &str = "processor_config.json";
@@ -194,13 +194,11 @@ fn check_keys(path: &Path, owner: &str, config: &Object, is_known: &dyn Fn(&str)
         .iter()
         .filter(|(key, value)| !is_known(key) && !asks_for_nothing(value));
     let unknown: Vec<&str> = unknown.map(|(key, _)| key.as_str()).collect();
-    if unknown.is_empty() {
-        return Ok(());
-    }
-    Err(Error::Input(problem!(
-        "source"; "{}: {owner}: {}: expected none: its release has no such option",
-        path.display(), unknown.join(", ")
-    )))
+    ensure!(
+        unknown.is_empty(), Input, "source";
+        "{}: {owner}: {}: expected none: its release has no such option", path.display(), unknown.join(", ")
+    );
+    Ok(())
 }
 
 fn refused<T>(path: &Path, what: &str) -> Result<T> {

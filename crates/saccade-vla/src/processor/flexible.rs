@@ -7,7 +7,7 @@ use super::options::MAX_AREA;
 use super::settings::{Flexible, Geometry};
 use crate::alloc::{filled, product};
 use crate::array::OwnedArray;
-use crate::error::{Error, Result, problem};
+use crate::error::{Error, Result, ensure, problem};
 use crate::ops::check_interrupted;
 use crate::release::{self, Fitting, Pixels};
 
@@ -43,11 +43,10 @@ pub(super) fn flexible_view(sizes: &Flexible, isa: Isa, name: &str, frame: Bytes
 
 fn check_ratio(name: &str, height: usize, width: usize) -> Result<()> {
     let (short, long) = (height.min(width), height.max(width));
-    if long > short.saturating_mul(MAX_RATIO) {
-        return Err(Error::Input(problem!(
-            name; expected "sides that differ by a factor of at most {MAX_RATIO}"; got "{height} x {width}"
-        )));
-    }
+    ensure!(
+        long <= short.saturating_mul(MAX_RATIO), Input, name;
+        expected "sides that differ by a factor of at most {MAX_RATIO}"; got "{height} x {width}"
+    );
     Ok(())
 }
 

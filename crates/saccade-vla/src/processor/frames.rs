@@ -7,7 +7,7 @@ use saccade_vla_kernels::Image;
 use super::settings::Settings;
 use crate::alloc::{collected, filled};
 use crate::array::{Array, OwnedArray, first_not_finite};
-use crate::error::{Error, Result, problem, show_shape};
+use crate::error::{Error, Result, ensure, problem, show_shape};
 use crate::ops::refused;
 use crate::release::Preprocessing;
 
@@ -71,11 +71,10 @@ pub(super) fn read<'a>(settings: &Settings, name: &str, frame: Frame<'a>) -> Res
         Frame::F32(array) => array.shape(),
         Frame::F64(array) => array.shape(),
     };
-    if !takes_lerobot && !matches!(frame, Frame::U8(_)) {
-        return Err(Error::Input(problem!(
-            name; "expected bytes (uint8): floating point frames are lerobot's"
-        )));
-    }
+    ensure!(
+        takes_lerobot || matches!(frame, Frame::U8(_)), Input, name;
+        "expected bytes (uint8): floating point frames are lerobot's"
+    );
     let expected = match takes_lerobot {
         true => "(height, width, 3) or (3, height, width)",
         false => "(height, width, 3)",

@@ -17,7 +17,7 @@ use saccade_vla_kernels::Isa;
 
 use crate::alloc::{filled, product, reserve};
 use crate::array::OwnedArray;
-use crate::error::{Error, Result, problem};
+use crate::error::{Error, Result, bail, ensure, problem};
 use crate::release::{Pixels, Preprocessing, Version, ViewRules, choice};
 use prompt::{SpecialIds, prompt};
 use settings::{Settings, Sizes};
@@ -82,9 +82,7 @@ impl Processor {
     pub fn new(version: Version, tokenizer: Tokenizer, options: &ProcessorOptions<'_>) -> Result<Self> {
         let Some(rules) = &version.release().processor else {
             let known = choice(Version::all().filter(|version| version.release().processor.is_some()));
-            return Err(Error::Input(
-                problem!("version"; expected "{known}"; got "{:?}", version.name()),
-            ));
+            bail!(Input, "version"; expected "{known}"; got "{:?}", version.name());
         };
         let settings = Settings::new(version, rules, options)?;
         let ids = SpecialIds::find(&tokenizer, version, &rules.prompt)?;
@@ -217,30 +215,23 @@ impl Processor {
     /// The order in which the views of each observation stand.
     fn orders(&self, observations: &[Observation<'_>]) -> Result<Vec<Vec<usize>>> {
         let Some(first) = observations.first() else {
-            return Err(Error::Input(problem!(
-                "frames"; expected "at least one observation"; got "none"
-            )));
+            bail!(Input, "frames"; expected "at least one observation"; got "none");
         };
         let mut orders: Vec<Vec<usize>> = Vec::with_capacity(observations.len());
         for observation in observations {
             let views = &observation.views;
-            if views.is_empty() {
-                return Err(Error::Input(problem!(
-                    "frames"; expected "at least one view"; got "none"
-                )));
-            }
+            ensure!(!views.is_empty(), Input, "frames"; expected "at least one view"; got "none");
             let mut order: Vec<usize> = (0..views.len()).collect();
             if self.settings.preprocessing == Preprocessing::Lerobot && !observation.is_ordered {
                 order.sort_by_key(|&index| views[index].0);
             }
             if let Some(expected) = orders.first() {
                 let (expected, got) = (names(first, expected), names(observation, &order));
-                if views.len() != first.views.len() || expected != got {
-                    return Err(Error::Input(problem!(
-                        "frames"; expected "the same views in every observation";
-                        got "{} and {}", show_views(first, expected), show_views(observation, got)
-                    )));
-                }
+                ensure!(
+                    views.len() == first.views.len() && expected == got, Input, "frames";
+                    expected "the same views in every observation";
+                    got "{} and {}", show_views(first, expected), show_views(observation, got)
+                );
             }
             orders.push(order);
         }
@@ -253,11 +244,10 @@ impl Processor {
         let expected = views
             .iter()
             .fold(0_usize, |sum, tokens| sum.saturating_add(*tokens));
-        if expected > most {
-            return Err(Error::Input(problem!(
-                "frames"; expected "at most {most} image tokens"; got "{expected} in {} views", views.len()
-            )));
-        }
+        ensure!(
+            expected <= most, Input, "frames";
+            expected "at most {most} image tokens"; got "{expected} in {} views", views.len()
+        );
         check_length("instruction", observation.instruction.unwrap_or_default())?;
         // A run of image tokens is tokenized as one of them, and then repeated.
         let once = self.ids.image_stands_alone;
@@ -272,12 +262,10 @@ impl Processor {
         let mut ids = self.tokenizer.ids("instruction", &text)?;
         let found = ids.iter().filter(|id| **id == self.ids.image).count();
         let written = written.iter().sum();
-        if found != written {
-            return Err(Error::Input(problem!(
-                "instruction"; expected "no token that stands for an image";
-                got "{} of them", found.saturating_sub(written)
-            )));
-        }
+        ensure!(
+            found == written, Input, "instruction";
+            expected "no token that stands for an image"; got "{} of them", found.saturating_sub(written)
+        );
         if once {
             let mut runs = views.iter().filter(|tokens| **tokens > 0);
             let mut repeated = Vec::new();
@@ -288,12 +276,10 @@ impl Processor {
             }
             ids = repeated;
         }
-        if ids.len() > most {
-            return Err(Error::Input(problem!(
-                "instruction"; expected "a prompt of at most {most} tokens";
-                got "{} with its {expected} image tokens", ids.len()
-            )));
-        }
+        ensure!(
+            ids.len() <= most, Input, "instruction";
+            expected "a prompt of at most {most} tokens"; got "{} with its {expected} image tokens", ids.len()
+        );
         Ok(ids)
     }
 

@@ -3,7 +3,7 @@
 use serde_json::Value;
 
 use crate::config::{Object, asks_for_nothing};
-use crate::error::{Error, Problem, Result, problem};
+use crate::error::{Error, Problem, Result, bail};
 use crate::release::{Pixels, Version, ViewRules};
 
 /// Larger sides, and larger areas, are hostile: the greatest area that is published is this one.
@@ -167,9 +167,7 @@ impl Options {
         match self.problems.len() {
             0 => Ok(()),
             1 => Err(Error::Input(Problem::new("options", self.problems.remove(0)))),
-            _ => Err(Error::Input(problem!(
-                "options"; "\n  {}", self.problems.join("\n  ")
-            ))),
+            _ => bail!(Input, "options"; "\n  {}", self.problems.join("\n  ")),
         }
     }
 

@@ -7,7 +7,7 @@ use regex::Regex;
 use super::python_text::{formalized, list_of};
 use super::settings::Settings;
 use super::tokenizer::Tokenizer;
-use crate::error::{Error, Result, problem};
+use crate::error::{Error, Result, bail, problem};
 use crate::release::{Preprocessing, PromptRules, Version, Wording};
 
 /// The placeholder of a frame, where a release has it.
@@ -94,9 +94,7 @@ fn text(settings: &Settings, instruction: Option<&str>, plain_text: bool) -> Res
         (Preprocessing::Lerobot, None | Some(""), _) => "Perform the task.",
         (_, Some(text), _) | (Preprocessing::Isaac, None, Some(text)) => text,
         (Preprocessing::Isaac, None, None) => {
-            return Err(Error::Input(problem!(
-                "instruction"; "expected text: Isaac-GR00T {} has no default", settings.version
-            )));
+            bail!(Input, "instruction"; "expected text: Isaac-GR00T {} has no default", settings.version);
         }
     };
     let text = match (settings.formalize_language, rules.wording, settings.preprocessing) {
@@ -111,10 +109,10 @@ fn text(settings: &Settings, instruction: Option<&str>, plain_text: bool) -> Res
     if rules.has_placeholders
         && let Some(found) = PLACEHOLDER.find(&text)
     {
-        return Err(Error::Input(problem!(
-            "instruction"; expected "none of the placeholders that stand for a frame";
-            got "{}", found.as_str()
-        )));
+        bail!(
+            Input, "instruction";
+            expected "none of the placeholders that stand for a frame"; got "{}", found.as_str()
+        );
     }
     Ok(text)
 }

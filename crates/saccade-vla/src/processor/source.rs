@@ -12,7 +12,7 @@ use super::tokenizer::TokenizerFiles;
 use super::{Processor, Tokenizer};
 use crate::backbone::backbones_in;
 use crate::config::{CheckpointConfig, Object, object_in_any};
-use crate::error::{Error, Result, problem, show_shape};
+use crate::error::{Error, Result, bail, ensure, problem, show_shape};
 use crate::recognise::HeadCheckpoint;
 use crate::release::{Names, Preprocessing, ProcessorRules, Version, ViewRules};
 
@@ -148,11 +148,10 @@ impl ProcessorSource {
 /// Refuses a config that names another version than the tensors.
 fn check_declared(config: &CheckpointConfig, version: Version) -> Result<()> {
     for declared in config.declared() {
-        if declared.version.is_some_and(|other| other != version) {
-            return Err(Error::Checkpoint(problem!(
-                "config"; "{}, but the tensors are those of {version}", declared.text
-            )));
-        }
+        ensure!(
+            !declared.version.is_some_and(|other| other != version), Checkpoint, "config";
+            "{}, but the tensors are those of {version}", declared.text
+        );
     }
     Ok(())
 }
@@ -200,9 +199,10 @@ fn square_sizes(
     if let Some(given) = config.and_then(given_image_size)
         && given != side as u64
     {
-        return Err(Error::Checkpoint(problem!(
-            "config"; "the image size is {given}, but {name} has {grid} x {grid} patches of {patch}"
-        )));
+        bail!(
+            Checkpoint, "config";
+            "the image size is {given}, but {name} has {grid} x {grid} patches of {patch}"
+        );
     }
     Ok((Some(side), Some(patches / taken)))
 }

@@ -4,7 +4,7 @@ use serde_json::Value;
 
 use super::layout::{CheckpointLayout, Contents, Evidence};
 use super::sizes::{DECODERS, FUTURE_TOKENS};
-use crate::error::{Error, Result, problem};
+use crate::error::{Error, Result, bail, problem};
 use crate::release::{Feature, Version};
 
 /// The one version that all evidence fits, and the evidence, a sentence each.
@@ -27,9 +27,10 @@ pub(super) fn recognise_version(
         [one] => one,
         [] => {
             let sentences: Vec<String> = sentences.collect();
-            return Err(Error::Checkpoint(problem!(
-                "source"; "what is found belongs to different versions of GR00T:\n  {}", sentences.join("\n  ")
-            )));
+            bail!(
+                Checkpoint, "source";
+                "what is found belongs to different versions of GR00T:\n  {}", sentences.join("\n  ")
+            );
         }
         // Nothing says which: a head alone, whose config names no model.
         _ => *possible

@@ -7,7 +7,7 @@ use serde_json::{Map, Value, json};
 use super::layout::{CheckpointLayout, Contents, Evidence};
 use super::sizes::{self, BLOCKS, FUTURE_TOKENS, HeadShapes, add_decoders, proved};
 use crate::config::{CheckpointConfig, OWN_KEY, Object, object_in_any};
-use crate::error::{Error, Result, problem};
+use crate::error::{Error, Result, ensure, problem};
 use crate::release::{Feature, Version};
 
 /// lerobot's: everything under `_groot_model.`, the policy's `config.json`.
@@ -137,15 +137,13 @@ fn from_tensors(policy: &Object, version: Version, tensors: &HeadShapes<'_>) -> 
             problems.push(format!("{key} is {given} in the config, but {shown}"));
         }
     }
-    if problems.is_empty() {
-        return Ok(head);
-    }
-    Err(Error::Checkpoint(problem!(
-        "source";
+    ensure!(
+        problems.is_empty(), Checkpoint, "source";
         "config.json (lerobot's, GR00T {}) and tensors do not make a head; the head's own config can be given as \
          `config`:\n  {}",
-        version, problems.join("\n  ")
-    )))
+         version, problems.join("\n  ")
+    );
+    Ok(head)
 }
 
 /// Adds both transformers' configs, and to `problems` what the tensors do not determine.

@@ -17,7 +17,7 @@ use saccade_vla_checkpoint::{Checkpoint, directory_of, read_text};
 use serde_json::Value;
 
 use crate::config::{CheckpointConfig, HeadConfig};
-use crate::error::{Error, Result, problem};
+use crate::error::{Error, Result, ensure, problem};
 use evidence::recognise_version;
 pub(crate) use layout::BACKBONE_PREFIXES;
 use layout::{CheckpointLayout, Contents};
@@ -85,12 +85,10 @@ impl HeadCheckpoint {
         let config_json = Value::Object(head).to_string();
         // What is wrong with the config alone comes first.
         let head = HeadConfig::from_json(&config_json)?;
-        if !problems.is_empty() {
-            return Err(Error::Checkpoint(problem!(
-                "source"; "config and tensors disagree (GR00T {}):\n  {}",
-                version, problems.join("\n  ")
-            )));
-        }
+        ensure!(
+            problems.is_empty(), Checkpoint, "source";
+            "config and tensors disagree (GR00T {}):\n  {}", version, problems.join("\n  ")
+        );
         Ok(Self {
             config: head,
             config_json,

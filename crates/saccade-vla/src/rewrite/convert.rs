@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use saccade_vla_checkpoint::spec::SCALE_SUFFIX;
 use saccade_vla_checkpoint::{Checkpoint, CheckpointWriter, Dtype, PlannedTensor};
 
-use crate::error::{Error, Result, problem};
+use crate::error::{Error, Result, ensure, problem};
 use crate::head::embodiments::chosen_embodiments;
 use crate::head::plan::tensor_specs;
 use crate::head::state_dropout::STATE_DROPOUT;
@@ -282,11 +282,10 @@ impl Rounding {
             if rounded == value {
                 continue;
             }
-            if !rounded.is_finite() {
-                return Err(Error::Checkpoint(problem!(
-                    "source"; "{name} holds {value}, more than {:?} can: expected another dtype", to.dtype()
-                )));
-            }
+            ensure!(
+                rounded.is_finite(), Checkpoint, "source";
+                "{name} holds {value}, more than {:?} can: expected another dtype", to.dtype()
+            );
             let error = (rounded - value).abs();
             self.count += 1;
             self.largest_relative = self.largest_relative.max(error / value.abs());

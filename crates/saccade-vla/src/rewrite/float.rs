@@ -3,7 +3,7 @@
 use half::{bf16, f16};
 use saccade_vla_checkpoint::Dtype;
 
-use crate::error::{Error, Result, problem};
+use crate::error::{Error, Result, bail};
 
 /// A type that weights are stored in.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -25,9 +25,7 @@ impl std::str::FromStr for Float {
             "float32" => Ok(Self::F32),
             "bfloat16" => Ok(Self::Bf16),
             "float16" => Ok(Self::F16),
-            _ => Err(Error::Input(problem!(
-                "dtype"; expected "float32, bfloat16 or float16"; got "{name}"
-            ))),
+            _ => bail!(Input, "dtype"; expected "float32, bfloat16 or float16"; got "{name}"),
         }
     }
 }

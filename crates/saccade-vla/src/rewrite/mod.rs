@@ -13,7 +13,7 @@ use std::path::{Path, PathBuf};
 use saccade_vla_checkpoint::{Checkpoint, CheckpointWriter, Companions, PlannedTensor};
 
 use crate::config::HeadConfig;
-use crate::error::{Error, Problem, Result, problem};
+use crate::error::{Error, Problem, Result, ensure};
 use crate::ops::check_interrupted;
 use adapter::is_beside;
 
@@ -202,10 +202,9 @@ fn check_apart<'a>(source: &'a Path, files: impl Iterator<Item = &'a Path>, out:
         return Ok(());
     };
     let is_inside = |path: &Path| path.canonicalize().is_ok_and(|from| from.starts_with(&to));
-    if std::iter::once(source).chain(files).any(is_inside) {
-        return Err(Error::Input(problem!(
-            "out"; "{} holds the source, expected another directory", out.display()
-        )));
-    }
+    ensure!(
+        !std::iter::once(source).chain(files).any(is_inside), Input, "out";
+        "{} holds the source, expected another directory", out.display()
+    );
     Ok(())
 }

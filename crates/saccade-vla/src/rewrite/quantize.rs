@@ -9,7 +9,7 @@ use saccade_vla_kernels::quantize_rows;
 
 use crate::alloc::filled;
 use crate::backbone::BackboneCheckpoint;
-use crate::error::{Error, Result, problem};
+use crate::error::{Error, Result, bail};
 use crate::head::plan::tensor_specs;
 use crate::nn::source::weight_view;
 use crate::ops::check_interrupted;
@@ -81,9 +81,7 @@ pub fn quantize(
         .iter()
         .find(|name| matches!(source.checkpoint.dtype(name), Ok(Dtype::I8)))
     {
-        return Err(Error::Checkpoint(problem!(
-            "source"; "it is quantised already: {name} is I8, expected F32, BF16 or F16"
-        )));
+        bail!(Checkpoint, "source"; "it is quantised already: {name} is I8, expected F32, BF16 or F16");
     }
     let mut planned = Vec::new();
     let mut report = QuantizeReport {
@@ -193,9 +191,7 @@ fn write_quantized(
         &mut scales,
     );
     if let Some(row) = scales.iter().position(|scale| !(127.0 * scale).is_finite()) {
-        return Err(Error::Checkpoint(problem!(
-            "source"; "{name} holds NaN or infinity in row {row}, expected finite weights"
-        )));
+        bail!(Checkpoint, "source"; "{name} holds NaN or infinity in row {row}, expected finite weights");
     }
     writer.tensor(name, bytemuck::cast_slice(&values))?;
     let scales: Vec<u8> = scales.into_iter().flat_map(f32::to_le_bytes).collect();
@@ -212,9 +208,7 @@ fn copy_finite(checkpoint: &Checkpoint, name: &str, writer: &mut CheckpointWrite
         check_interrupted()?;
         float.read(bytes, &mut values);
         if let Some(bad) = values.iter().find(|value| !value.is_finite()) {
-            return Err(Error::Checkpoint(problem!(
-                "source"; "{name} holds {bad}, expected finite weights"
-            )));
+            bail!(Checkpoint, "source"; "{name} holds {bad}, expected finite weights");
         }
         Ok(writer.tensor(name, bytes)?)
     })

@@ -4,7 +4,7 @@ use saccade_vla_kernels::{Rows, RowsMut};
 
 use crate::array::Array;
 use crate::config::HeadConfig;
-use crate::error::{Error, Result, problem, show_shape};
+use crate::error::{Error, Result, bail, ensure, show_shape};
 
 /// The chunk before, and how it is taken over. Of its first `horizon` actions the last `overlap` become the first ones of the new chunk, without
 /// noise: the first `frozen` of these stay as they are, the rest follow the velocity the more, the later they come.
@@ -45,17 +45,15 @@ impl<'a> Chunking<'a> {
             ("overlap", self.overlap, horizon, "horizon"),
             ("frozen", self.frozen, self.overlap, "overlap"),
         ] {
-            if given > most {
-                return Err(Error::Input(problem!(
-                    format_args!("chunking: {name}"); expected "at most {most} ({of})"; got "{given}"
-                )));
-            }
+            ensure!(
+                given <= most, Input, format_args!("chunking: {name}");
+                expected "at most {most} ({of})"; got "{given}"
+            );
         }
-        if !(self.ramp_rate.is_finite() && self.ramp_rate > 0.0) {
-            return Err(Error::Input(problem!(
-                "chunking: ramp_rate"; expected "a finite number above 0"; got "{}", self.ramp_rate
-            )));
-        }
+        ensure!(
+            self.ramp_rate.is_finite() && self.ramp_rate > 0.0, Input, "chunking: ramp_rate";
+            expected "a finite number above 0"; got "{}", self.ramp_rate
+        );
         let widths = [config.encoder_action_dim, config.action_dim];
         match *self.previous_chunk.shape() {
             [given, rows, width]
@@ -67,12 +65,12 @@ impl<'a> Chunking<'a> {
                     [encoder, action] if encoder == action => format!("{encoder}"),
                     [encoder, action] => format!("{encoder} or {action}"),
                 };
-                return Err(Error::Shape(problem!(
-                    "previous_chunk";
+                bail!(
+                    Shape, "previous_chunk";
                     expected "(batch, rows, width) with batch {batch}, {horizon} to {} rows and width {widths}",
                     config.action_horizon;
                     got "{}", show_shape(self.previous_chunk.shape())
-                )));
+                );
             }
         }
         Ok(Seam {

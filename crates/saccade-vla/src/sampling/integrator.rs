@@ -5,7 +5,7 @@
 use saccade_vla_kernels::{Rows, RowsMut};
 
 use crate::alloc::Scratch;
-use crate::error::{Error, Result, problem};
+use crate::error::{Error, Result, bail};
 
 /// The scheme of one integration step of length `dt`, from `x` at flow time `t`, along the velocity `v`.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -27,9 +27,7 @@ impl Integrator {
         match name {
             "euler" => Ok(Self::Euler),
             "midpoint" => Ok(Self::Midpoint),
-            _ => Err(Error::Input(problem!(
-                "integrator"; expected "euler or midpoint"; got "{name}"
-            ))),
+            _ => bail!(Input, "integrator"; expected "euler or midpoint"; got "{name}"),
         }
     }
 

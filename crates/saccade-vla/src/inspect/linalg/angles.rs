@@ -4,7 +4,7 @@ use super::matrix::{MATRIX, Matrix, check_rows, times};
 use super::svd::Svd;
 use crate::alloc::collected;
 use crate::array::Array;
-use crate::error::{Error, Result, problem};
+use crate::error::{Error, Result, bail};
 
 /// The principal angles between the spans of the columns of two matrices, ascending, in radians, 0 to pi/2.
 ///
@@ -57,9 +57,7 @@ const AXES: &str = "(dimensions, vectors)";
 fn orthonormal(name: &'static str, x: Matrix) -> Result<Matrix> {
     let svd = Svd::new(x)?;
     match svd.rank() {
-        0 => Err(Error::Input(problem!(
-            name; expected "a column that is not zero"; got "zeros only"
-        ))),
+        0 => bail!(Input, name; expected "a column that is not zero"; got "zeros only"),
         rank => Ok(svd.left.truncated(rank)),
     }
 }

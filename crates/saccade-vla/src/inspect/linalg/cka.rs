@@ -2,7 +2,7 @@
 
 use super::matrix::{Matrix, check_rows, check_two_rows, times};
 use crate::array::Array;
-use crate::error::{Error, Result, problem};
+use crate::error::{Error, Result, ensure};
 
 /// Linear centred kernel alignment (CKA) of two sets of features of the same observations, 0 to 1.
 ///
@@ -53,10 +53,9 @@ pub fn linear_cka(x: Array<'_, f64>, y: Array<'_, f64>) -> Result<f64> {
 fn varying(name: &'static str, mut x: Matrix) -> Result<Matrix> {
     x.centre()?;
     x.scale_by_power_of_two();
-    if x.data().iter().all(|&value| value == 0.0) {
-        return Err(Error::Input(problem!(
-            name; expected "a feature that varies between rows"; got "constant columns only"
-        )));
-    }
+    ensure!(
+        !x.data().iter().all(|&value| value == 0.0), Input, name;
+        expected "a feature that varies between rows"; got "constant columns only"
+    );
     Ok(x)
 }

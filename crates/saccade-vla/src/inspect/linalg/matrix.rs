@@ -5,7 +5,7 @@ use faer::{Accum, MatMut, MatRef, Par};
 
 use crate::alloc::{collected, filled, product};
 use crate::array::{Array, OwnedArray, unravel};
-use crate::error::{Error, Result, problem, show_shape};
+use crate::error::{Error, Result, bail, ensure, show_shape};
 
 /// A matrix, row after row.
 #[derive(Clone, Debug)]
@@ -28,20 +28,18 @@ impl Matrix {
     /// An argument with two axes, at least one element and no NaN or infinity.
     pub(super) fn checked(name: &'static str, axes: &str, array: Array<'_, f64>) -> Result<Self> {
         let [rows, columns] = *array.shape() else {
-            return Err(Error::Shape(problem!(
-                name; expected "two axes, {axes}"; got "{}", show_shape(array.shape())
-            )));
+            bail!(Shape, name; expected "two axes, {axes}"; got "{}", show_shape(array.shape()));
         };
-        if rows == 0 || columns == 0 {
-            return Err(Error::Shape(problem!(
-                name; expected "{axes} of at least one element"; got "{}", show_shape(array.shape())
-            )));
-        }
+        ensure!(
+            rows > 0 && columns > 0, Shape, name;
+            expected "{axes} of at least one element"; got "{}", show_shape(array.shape())
+        );
         if let Some(position) = array.data().iter().position(|value| !value.is_finite()) {
-            return Err(Error::Input(problem!(
-                name; expected "finite values";
+            bail!(
+                Input, name;
+                expected "finite values";
                 got "{} at index {}", array.data()[position], show_shape(&unravel(position, array.shape()))
-            )));
+            );
         }
         Ok(Self {
             data: collected(name, array.data().len(), array.data().iter().copied())?,
@@ -212,42 +210,34 @@ pub(super) fn times(a: MatRef<'_, f64>, b: MatRef<'_, f64>) -> Result<Matrix> {
 
 /// That the columns of `x` are as many as something was fitted to.
 pub(super) fn check_columns(x: &Matrix, fitted: usize) -> Result<()> {
-    if x.columns() == fitted {
-        return Ok(());
-    }
     let (rows, columns) = (x.rows(), x.columns());
-    Err(Error::Shape(problem!(
-        "x"; expected "(rows, features) = ({rows}, {fitted})"; got "({rows}, {columns})"
-    )))
+    ensure!(
+        x.columns() == fitted, Shape, "x";
+        expected "(rows, features) = ({rows}, {fitted})"; got "({rows}, {columns})"
+    );
+    Ok(())
 }
 
 /// That `y` has as many rows as `x`.
 pub(super) fn check_rows(name: &str, axes: &str, x: &Matrix, y: &Matrix) -> Result<()> {
-    if x.rows() == y.rows() {
-        return Ok(());
-    }
     let (rows, given, columns) = (x.rows(), y.rows(), y.columns());
-    Err(Error::Shape(problem!(
-        name; expected "{axes} = ({rows}, {columns})"; got "({given}, {columns})"
-    )))
+    ensure!(
+        x.rows() == y.rows(), Shape, name; expected "{axes} = ({rows}, {columns})"; got "({given}, {columns})"
+    );
+    Ok(())
 }
 
 /// That there are two rows, between which something can vary.
 pub(super) fn check_two_rows(name: &str, x: &Matrix) -> Result<()> {
-    if x.rows() >= 2 {
-        return Ok(());
-    }
-    Err(Error::Shape(
-        problem!(name; expected "at least 2 rows"; got "{}", x.rows()),
-    ))
+    ensure!(x.rows() >= 2, Shape, name; expected "at least 2 rows"; got "{}", x.rows());
+    Ok(())
 }
 
 /// That no element of a result overflowed.
 pub(super) fn check_result(name: &str, data: &[f64]) -> Result<()> {
-    if data.iter().all(|value| value.is_finite()) {
-        return Ok(());
-    }
-    Err(Error::Input(problem!(
-        name; "the result is not finite: values are too large for float64"
-    )))
+    ensure!(
+        data.iter().all(|value| value.is_finite()), Input, name;
+        "the result is not finite: values are too large for float64"
+    );
+    Ok(())
 }

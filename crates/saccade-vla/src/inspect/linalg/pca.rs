@@ -4,7 +4,7 @@ use super::matrix::{MATRIX, Matrix, check_columns, check_result, check_two_rows,
 use super::svd::Svd;
 use crate::alloc::collected;
 use crate::array::{Array, OwnedArray};
-use crate::error::{Error, Result, problem};
+use crate::error::{Error, Result, ensure};
 
 /// Principal components: the orthonormal directions along which rows vary most.
 ///
@@ -42,12 +42,10 @@ impl Pca {
         let mut x = Matrix::checked("x", "(rows, features)", x)?;
         check_two_rows("x", &x)?;
         let most = x.rows().min(x.columns());
-        if components == 0 || components > most {
-            return Err(Error::Input(problem!(
-                "components"; expected "1 to {most} for x of shape ({}, {})", x.rows(), x.columns();
-                got "{components}"
-            )));
-        }
+        ensure!(
+            (1..=most).contains(&components), Input, "components";
+            expected "1 to {most} for x of shape ({}, {})", x.rows(), x.columns(); got "{components}"
+        );
         let mean = x.centre()?.mean;
         let divisor = (x.rows() - 1) as f64;
         let Svd { singular, right, .. } = Svd::new(x)?;

@@ -6,7 +6,7 @@ use super::matrix::{MATRIX, Matrix, check_columns, check_result, check_rows, tim
 use super::svd::Svd;
 use crate::alloc::{filled, product, reserved};
 use crate::array::{Array, OwnedArray};
-use crate::error::{Error, Result, problem};
+use crate::error::{Error, Result, bail, ensure};
 use crate::ops::check_interrupted;
 
 /// Ridge regression with an intercept, for several penalties at once.
@@ -137,15 +137,9 @@ fn shrinkage(singular: f64, alpha: f64, rounding: f64) -> f64 {
 }
 
 fn check_penalties(alphas: &[f64]) -> Result<()> {
-    if alphas.is_empty() {
-        return Err(Error::Input(problem!(
-            "alphas"; expected "at least one penalty"; got "none"
-        )));
-    }
+    ensure!(!alphas.is_empty(), Input, "alphas"; expected "at least one penalty"; got "none");
     match alphas.iter().find(|alpha| !(alpha.is_finite() && **alpha >= 0.0)) {
         None => Ok(()),
-        Some(alpha) => Err(Error::Input(problem!(
-            "alphas"; expected "finite penalties of at least 0"; got "{alpha}"
-        ))),
+        Some(alpha) => bail!(Input, "alphas"; expected "finite penalties of at least 0"; got "{alpha}"),
     }
 }

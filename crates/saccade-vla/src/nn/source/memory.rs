@@ -11,7 +11,7 @@ use safetensors::Dtype;
 use super::{Request, Source, Tensor};
 use crate::alloc::reserve;
 use crate::array::check_length;
-use crate::error::{Error, Problem, Result, problem, show_shape};
+use crate::error::{Error, Problem, Result, bail, problem, show_shape};
 use crate::ops::check_interrupted;
 use saccade_vla_checkpoint::spec::{self, TensorProblem};
 use saccade_vla_checkpoint::{Elements, TensorSpec};
@@ -182,9 +182,10 @@ impl Source for MemorySource<'_> {
                 elements.range(range).to_elements(None)?
             }
             (Some(slices), _) => {
-                return Err(Error::Checkpoint(problem!(
-                    "tensors"; "{} has shape {} and no slices {slices:?}", spec.name, show_shape(shape)
-                )));
+                bail!(
+                    Checkpoint, "tensors";
+                    "{} has shape {} and no slices {slices:?}", spec.name, show_shape(shape)
+                );
             }
         };
         Ok(Tensor::Held(elements))

@@ -17,7 +17,7 @@ use tokenizers::{
     AddedToken, Decoder, DecoderWrapper, PostProcessorWrapper, SplitDelimiterBehavior, TokenizerImpl,
 };
 
-use crate::error::{Error, Problem, Result, problem};
+use crate::error::{Error, Problem, Result, bail, problem};
 use find::FilesText;
 use parts::{PATTERN, Parts};
 
@@ -33,9 +33,7 @@ const MAX_TEXT_BYTES: usize = 1 << 18;
 pub(super) fn check_length(name: &str, text: &str) -> Result<()> {
     match text.len() {
         ..=MAX_TEXT_BYTES => Ok(()),
-        len => Err(Error::Input(problem!(
-            name; expected "at most {MAX_TEXT_BYTES} bytes of text"; got "{len}"
-        ))),
+        len => bail!(Input, name; expected "at most {MAX_TEXT_BYTES} bytes of text"; got "{len}"),
     }
 }
 

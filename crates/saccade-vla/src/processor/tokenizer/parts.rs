@@ -7,7 +7,7 @@ use serde::de::{Deserialize, Deserializer, Error as _, MapAccess, Visitor};
 use tokenizers::models::bpe::{Merges, Vocab};
 use tokenizers::pre_tokenizers::byte_level::ByteLevel;
 
-use crate::error::{Error, Problem, Result, problem};
+use crate::error::{Error, Result, bail};
 
 /// No model has as many rows in its embedding table.
 const MAX_ID: u32 = 1 << 24;
@@ -171,10 +171,8 @@ impl Problems {
         }
         match &self.listed[..] {
             [] => Ok(()),
-            [problem] => Err(Error::Checkpoint(Problem::new("tokenizer", problem))),
-            problems => Err(Error::Checkpoint(problem!(
-                "tokenizer"; "it is broken:\n  {}", problems.join("\n  ")
-            ))),
+            [problem] => bail!(Checkpoint, "tokenizer"; "{problem}"),
+            problems => bail!(Checkpoint, "tokenizer"; "it is broken:\n  {}", problems.join("\n  ")),
         }
     }
 }

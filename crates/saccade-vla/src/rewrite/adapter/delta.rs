@@ -3,7 +3,7 @@
 use saccade_vla_checkpoint::{Checkpoint, Elements, reserve};
 
 use crate::alloc::filled;
-use crate::error::{Error, Result, problem};
+use crate::error::{Error, Result, bail};
 
 /// The names of a product's factors in the adapter's file, and how they are multiplied.
 pub(super) struct Factors {
@@ -91,9 +91,7 @@ fn finite(checkpoint: &Checkpoint, name: &str) -> Result<Vec<f32>> {
     let values = checkpoint.read(name).map(Elements::into_f32)??;
     match values.iter().find(|value| !value.is_finite()) {
         None => Ok(values),
-        Some(bad) => Err(Error::Checkpoint(problem!(
-            "adapter"; "{name} holds {bad}, expected finite numbers"
-        ))),
+        Some(bad) => bail!(Checkpoint, "adapter"; "{name} holds {bad}, expected finite numbers"),
     }
 }
 

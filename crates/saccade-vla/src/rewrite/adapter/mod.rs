@@ -14,7 +14,7 @@ use saccade_vla_checkpoint::{
 };
 use serde_json::value::RawValue;
 
-use crate::error::{Error, Result, problem};
+use crate::error::{Error, Result, bail, ensure, problem};
 use crate::recognise::HeadCheckpoint;
 use crate::rewrite::float::Float;
 use crate::rewrite::json_edit::{find, span};
@@ -97,22 +97,20 @@ impl Adapter {
     /// [`Error::File`] for files that are not there or broken; [`Error::Checkpoint`] for an adapter of another kind, for one that does not fit
     /// the base, and for a base in int8.
     pub(crate) fn open(directory: &Path, base: &Checkpoint) -> Result<Self> {
-        if !directory.is_dir() {
-            return Err(Error::Input(problem!(
-                "adapter"; expected "a directory with {ADAPTER_CONFIG} and {ADAPTER_WEIGHTS}";
-                got "{}", directory.display()
-            )));
-        }
+        ensure!(
+            directory.is_dir(), Input, "adapter";
+            expected "a directory with {ADAPTER_CONFIG} and {ADAPTER_WEIGHTS}"; got "{}", directory.display()
+        );
         let config = AdapterConfig::read(directory)?;
         let checkpoint = Checkpoint::open_file(&weights_of(directory)?)?;
         if let Some(name) = base
             .names()
             .find(|name| matches!(base.dtype(name), Ok(Dtype::I8)))
         {
-            return Err(Error::Checkpoint(problem!(
-                "source";
+            bail!(
+                Checkpoint, "source";
                 "{name} is I8: expected weights that are not quantised; merge the adapter first, then quantise"
-            )));
+            );
         }
         let mut changes = BTreeMap::new();
         let mut problems = Vec::new();
@@ -175,13 +173,11 @@ impl Adapter {
 
 fn weights_of(directory: &Path) -> Result<PathBuf> {
     let weights = directory.join(ADAPTER_WEIGHTS);
-    if !weights.exists() && directory.join("adapter_model.bin").exists() {
-        return Err(Error::Checkpoint(problem!(
-            "adapter";
-            "{} holds adapter_model.bin, expected {ADAPTER_WEIGHTS}: save it again with PEFT's save_pretrained, which writes that",
-            directory.display()
-        )));
-    }
+    ensure!(
+        weights.exists() || !directory.join("adapter_model.bin").exists(), Checkpoint, "adapter";
+        "{} holds adapter_model.bin, expected {ADAPTER_WEIGHTS}: save it again with PEFT's save_pretrained, which writes that",
+        directory.display()
+    );
     Ok(weights)
 }
 

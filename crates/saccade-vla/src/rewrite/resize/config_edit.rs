@@ -6,7 +6,7 @@ use serde_json::Value;
 use serde_json::value::RawValue;
 
 use crate::config::{HEAD_KEY, HeadConfig, OWN_KEY};
-use crate::error::{Error, Problem, Result, problem};
+use crate::error::{Error, Problem, Result, ensure};
 use crate::release::Feature;
 use crate::rewrite::json_edit::{Found, entry, find, span};
 
@@ -73,11 +73,7 @@ pub(super) fn config_edit(config: &HeadConfig, given: &str, count: usize) -> Res
                 .to_owned(),
         );
     }
-    if count > MAX_TOKENS {
-        return Err(Error::Input(problem!(
-            "num_future_tokens"; expected "at most {MAX_TOKENS}"; got "{count}"
-        )));
-    }
+    ensure!(count <= MAX_TOKENS, Input, "num_future_tokens"; expected "at most {MAX_TOKENS}"; got "{count}");
     if before > MAX_TOKENS {
         return bad(
             "source",

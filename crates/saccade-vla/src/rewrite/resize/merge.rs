@@ -5,7 +5,7 @@
 use saccade_vla_checkpoint::{probe_allocation, reserve};
 
 use crate::alloc::filled;
-use crate::error::{Error, Problem, Result, problem};
+use crate::error::{Error, Result, bail, ensure};
 use crate::ops::check_interrupted;
 
 /// A smaller bias is rounding error of the logarithms and is written as no bias.
@@ -42,30 +42,26 @@ pub fn merge_future_tokens(
     num_future_tokens: usize,
     key_bias: Option<&[f32]>,
 ) -> Result<MergedTokens> {
-    if width == 0 || !tokens.len().is_multiple_of(width) {
-        return Err(Error::Shape(problem!(
-            "tokens"; expected "rows of {width} elements"; got "{} elements", tokens.len()
-        )));
-    }
+    ensure!(
+        width > 0 && tokens.len().is_multiple_of(width), Shape, "tokens";
+        expected "rows of {width} elements"; got "{} elements", tokens.len()
+    );
     let count = tokens.len() / width;
     let zeros = filled("key_bias", count, 0.0)?;
     let key_bias = key_bias.unwrap_or(&zeros);
-    if key_bias.len() != count {
-        return Err(Error::Shape(problem!(
-            "key_bias"; expected "{count} elements, one per token"; got "{}", key_bias.len()
-        )));
-    }
+    ensure!(
+        key_bias.len() == count, Shape, "key_bias";
+        expected "{count} elements, one per token"; got "{}", key_bias.len()
+    );
     for (what, values) in [("tokens", tokens), ("key_bias", key_bias)] {
         if let Some(bad) = values.iter().find(|value| !value.is_finite()) {
-            return Err(Error::Input(Problem::expected(what, "finite numbers", bad)));
+            bail!(Input, what; expected "finite numbers"; got "{bad}");
         }
     }
-    if num_future_tokens > count {
-        return Err(Error::Input(problem!(
-            "num_future_tokens"; expected "at most the {count} tokens that are given";
-            got "{num_future_tokens}"
-        )));
-    }
+    ensure!(
+        num_future_tokens <= count, Input, "num_future_tokens";
+        expected "at most the {count} tokens that are given"; got "{num_future_tokens}"
+    );
     resized(tokens, width, key_bias, num_future_tokens)
 }
 

@@ -13,7 +13,7 @@ use std::path::Path;
 
 use saccade_vla_checkpoint::{OWN_CONFIG, reserve};
 
-use crate::error::{Error, Result, problem};
+use crate::error::{Error, Result, bail};
 use crate::recognise::sizes::FUTURE_TOKENS;
 use crate::rewrite::float::Float;
 use crate::rewrite::{RewriteOptions, SourceCheckpoint, Written};
@@ -103,9 +103,7 @@ pub fn resize(
     let name = format!("{}{FUTURE_TOKENS}", source.prefix);
     let tokens = source.checkpoint.read(&name)?.into_f32()?;
     if let Some(bad) = tokens.iter().find(|value| !value.is_finite()) {
-        return Err(Error::Checkpoint(problem!(
-            "source"; "{name} holds {bad}, expected finite numbers"
-        )));
+        bail!(Checkpoint, "source"; "{name} holds {bad}, expected finite numbers");
     }
     let no_bias = || vec![0.0; config.num_future_tokens];
     let bias = config.future_key_bias.clone().unwrap_or_else(no_bias);

@@ -1,6 +1,6 @@
 //! Noise on the copies of future tokens, so that training can tell them apart.
 
-use crate::error::{Error, Result, problem};
+use crate::error::{Error, Result, bail, ensure};
 
 /// Adds noise to `resized`, rows that begin with the `before` rows of `tokens`, from row `before` on; returns the noise's root mean square,
 /// which is `amount` times that of `tokens`.
@@ -15,21 +15,19 @@ pub(super) fn perturb(
     amount: f64,
     seed: u64,
 ) -> Result<f64> {
-    if !(amount.is_finite() && amount >= 0.0) {
-        return Err(Error::Input(problem!(
-            "perturbation"; expected "a finite number of at least 0"; got "{amount}"
-        )));
-    }
+    ensure!(
+        amount.is_finite() && amount >= 0.0, Input, "perturbation";
+        expected "a finite number of at least 0"; got "{amount}"
+    );
     if amount == 0.0 {
         return Ok(0.0);
     }
     let width = tokens.len() / before;
     let count = resized.len() / width;
-    if count <= before {
-        return Err(Error::Input(problem!(
-            "perturbation"; "copies are perturbed, and of {before} future tokens {count} have none"
-        )));
-    }
+    ensure!(
+        count > before, Input, "perturbation";
+        "copies are perturbed, and of {before} future tokens {count} have none"
+    );
     let squares: f64 = tokens.iter().map(|&value| f64::from(value).powi(2)).sum();
     let scale = amount * (squares / tokens.len() as f64).sqrt();
     let mut state = seed;
@@ -45,10 +43,10 @@ pub(super) fn perturb(
         .iter()
         .find(|value| value.is_nan() || f64::from(value.abs()) > bound)
     {
-        return Err(Error::Input(problem!(
-            "perturbation";
+        bail!(
+            Input, "perturbation";
             "{amount:?} gives a token with an element of {large:e}; a layer norm of {width} float32 elements overflows above {bound:.1e}"
-        )));
+        );
     }
     Ok((added / ((count - before) * width) as f64).sqrt())
 }
