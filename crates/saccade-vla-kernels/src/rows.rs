@@ -63,8 +63,8 @@ impl<T> Clone for Rows<'_, T> {
 
 impl<T> Copy for Rows<'_, T> {}
 
-/// The sizes of both views.
-macro_rules! sizes {
+/// The sizes and the parts of both views.
+macro_rules! sizes_and_parts {
     () => {
         /// Number of rows.
         #[inline]
@@ -85,6 +85,30 @@ macro_rules! sizes {
         #[must_use]
         pub fn row_stride(&self) -> usize {
             self.shape.row_stride
+        }
+
+        /// The rows in `rows`.
+        ///
+        /// # Panics
+        /// If not all of them exist.
+        #[must_use]
+        #[track_caller]
+        #[inline]
+        pub fn rows(self, rows: Range<usize>) -> Self {
+            let (shape, start) = self.shape.rows(&rows);
+            Self::of(self.first.wrapping_add(start), shape)
+        }
+
+        /// The columns in `columns` of all rows.
+        ///
+        /// # Panics
+        /// If not all of them exist.
+        #[must_use]
+        #[track_caller]
+        #[inline]
+        pub fn columns(self, columns: Range<usize>) -> Self {
+            let (shape, start) = self.shape.columns(&columns);
+            Self::of(self.first.wrapping_add(start), shape)
         }
     };
 }
@@ -138,7 +162,7 @@ impl<'a, T> Rows<'a, T> {
         }
     }
 
-    sizes!();
+    sizes_and_parts!();
 
     /// Row number `row`.
     ///
@@ -158,30 +182,6 @@ impl<'a, T> Rows<'a, T> {
     pub fn iter(&self) -> impl ExactSizeIterator<Item = &'a [T]> + use<'a, T> {
         let rows = *self;
         (0..rows.num_rows()).map(move |row| rows.row(row))
-    }
-
-    /// The rows in `rows`.
-    ///
-    /// # Panics
-    /// If not all of them exist.
-    #[must_use]
-    #[track_caller]
-    #[inline]
-    pub fn rows(&self, rows: Range<usize>) -> Self {
-        let (shape, start) = self.shape.rows(&rows);
-        Self::of(self.first.wrapping_add(start), shape)
-    }
-
-    /// The columns in `columns` of all rows.
-    ///
-    /// # Panics
-    /// If not all of them exist.
-    #[must_use]
-    #[track_caller]
-    #[inline]
-    pub fn columns(&self, columns: Range<usize>) -> Self {
-        let (shape, start) = self.shape.columns(&columns);
-        Self::of(self.first.wrapping_add(start), shape)
     }
 
     /// Each `count` consecutive rows as one.
@@ -271,7 +271,7 @@ impl<'a, T> RowsMut<'a, T> {
         }
     }
 
-    sizes!();
+    sizes_and_parts!();
 
     /// Row number `row`.
     ///
@@ -308,30 +308,6 @@ impl<'a, T> RowsMut<'a, T> {
     #[must_use]
     pub fn reborrow(&mut self) -> RowsMut<'_, T> {
         RowsMut::of(self.first, self.shape)
-    }
-
-    /// The rows in `rows`.
-    ///
-    /// # Panics
-    /// If not all of them exist.
-    #[must_use]
-    #[track_caller]
-    #[inline]
-    pub fn rows(self, rows: Range<usize>) -> Self {
-        let (shape, start) = self.shape.rows(&rows);
-        Self::of(self.first.wrapping_add(start), shape)
-    }
-
-    /// The columns in `columns` of all rows.
-    ///
-    /// # Panics
-    /// If not all of them exist.
-    #[must_use]
-    #[track_caller]
-    #[inline]
-    pub fn columns(self, columns: Range<usize>) -> Self {
-        let (shape, start) = self.shape.columns(&columns);
-        Self::of(self.first.wrapping_add(start), shape)
     }
 }
 

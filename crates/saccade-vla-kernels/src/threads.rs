@@ -158,61 +158,60 @@ mod linux {
 
     #[cfg(test)]
     mod tests {
+        use std::collections::BTreeMap;
+
         use super::*;
 
-        fn files(files: &'static [(&str, &str)]) -> impl Fn(&Path) -> Option<String> {
-            move |path| {
-                let found = files.iter().find(|(name, _)| Path::new(name) == path);
-                found.map(|(_, text)| (*text).to_owned())
+        fn files(files: &[(&str, &str)]) -> impl Fn(&Path) -> Option<String> {
+            let files: BTreeMap<PathBuf, String> = files
+                .iter()
+                .map(|(path, text)| (path.into(), format!("{text}\n")))
+                .collect();
+            move |path| files.get(path).cloned()
+        }
+
+        /// A machine that allows these processors, with files of `/sys/devices` about them.
+        fn machine(allowed: &str, about: &[(&str, &str)]) -> impl Fn(&Path) -> Option<String> {
+            let status = format!("Name:\tx\nCpus_allowed_list:\t{allowed}\n");
+            let devices = files(about);
+            move |path| match path.strip_prefix("/sys/devices") {
+                Ok(path) => devices(path),
+                Err(_) => (path == Path::new("/proc/self/status")).then(|| status.clone()),
             }
         }
 
         #[test]
         fn siblings_count_once() {
-            let read = files(&[
-                ("/proc/self/status", "Name:\tx\nCpus_allowed_list:\t0-2,5\n"),
-                (
-                    "/sys/devices/system/cpu/cpu0/topology/thread_siblings_list",
-                    "0,4\n",
-                ),
-                (
-                    "/sys/devices/system/cpu/cpu1/topology/thread_siblings_list",
-                    "1,5\n",
-                ),
-                (
-                    "/sys/devices/system/cpu/cpu2/topology/thread_siblings_list",
-                    "2,6\n",
-                ),
-                (
-                    "/sys/devices/system/cpu/cpu5/topology/thread_siblings_list",
-                    "1,5\n",
-                ),
-            ]);
+            let read = machine(
+                "0-2,5",
+                &[
+                    ("system/cpu/cpu0/topology/thread_siblings_list", "0,4"),
+                    ("system/cpu/cpu1/topology/thread_siblings_list", "1,5"),
+                    ("system/cpu/cpu2/topology/thread_siblings_list", "2,6"),
+                    ("system/cpu/cpu5/topology/thread_siblings_list", "1,5"),
+                ],
+            );
             assert_eq!(allowed_cores(&read), Some(3));
         }
 
         #[test]
         fn without_topology_every_processor_is_a_core() {
-            assert_eq!(
-                allowed_cores(&files(&[("/proc/self/status", "Cpus_allowed_list:\t0-2,5\n")])),
-                Some(4)
-            );
-            assert_eq!(
-                allowed_cores(&files(&[("/proc/self/status", "Cpus_allowed_list:\tx\n")])),
-                None
-            );
+            assert_eq!(allowed_cores(&machine("0-2,5", &[])), Some(4));
+            assert_eq!(allowed_cores(&machine("x", &[])), None);
             assert_eq!(allowed_cores(&files(&[])), None);
         }
 
         #[test]
         fn little_cores_do_not_count() {
-            let read = files(&[
-                ("/proc/self/status", "Cpus_allowed_list:\t0-3\n"),
-                ("/sys/devices/system/cpu/cpu0/cpu_capacity", "398\n"),
-                ("/sys/devices/system/cpu/cpu1/cpu_capacity", "398\n"),
-                ("/sys/devices/system/cpu/cpu2/cpu_capacity", "1024\n"),
-                ("/sys/devices/system/cpu/cpu3/cpu_capacity", "700\n"),
-            ]);
+            let read = machine(
+                "0-3",
+                &[
+                    ("system/cpu/cpu0/cpu_capacity", "398"),
+                    ("system/cpu/cpu1/cpu_capacity", "398"),
+                    ("system/cpu/cpu2/cpu_capacity", "1024"),
+                    ("system/cpu/cpu3/cpu_capacity", "700"),
+                ],
+            );
             assert_eq!(allowed_cores(&read), Some(2));
             assert_eq!(fast(&read, vec![0, 1]), [0, 1]); // no others may be used
             assert_eq!(fast(&read, vec![0, 2, 4]), [0, 2, 4]); // of one nothing is known
@@ -220,27 +219,17 @@ mod linux {
 
         #[test]
         fn efficiency_cores_do_not_count() {
-            let read = files(&[
-                ("/proc/self/status", "Cpus_allowed_list:\t0-7\n"),
-                ("/sys/devices/cpu_core/cpus", "0-3\n"),
-                ("/sys/devices/cpu_atom/cpus", "4-7\n"),
-                (
-                    "/sys/devices/system/cpu/cpu0/topology/thread_siblings_list",
-                    "0-1\n",
-                ),
-                (
-                    "/sys/devices/system/cpu/cpu1/topology/thread_siblings_list",
-                    "0-1\n",
-                ),
-                (
-                    "/sys/devices/system/cpu/cpu2/topology/thread_siblings_list",
-                    "2-3\n",
-                ),
-                (
-                    "/sys/devices/system/cpu/cpu3/topology/thread_siblings_list",
-                    "2-3\n",
-                ),
-            ]);
+            let read = machine(
+                "0-7",
+                &[
+                    ("cpu_core/cpus", "0-3"),
+                    ("cpu_atom/cpus", "4-7"),
+                    ("system/cpu/cpu0/topology/thread_siblings_list", "0-1"),
+                    ("system/cpu/cpu1/topology/thread_siblings_list", "0-1"),
+                    ("system/cpu/cpu2/topology/thread_siblings_list", "2-3"),
+                    ("system/cpu/cpu3/topology/thread_siblings_list", "2-3"),
+                ],
+            );
             assert_eq!(allowed_cores(&read), Some(2));
             assert_eq!(fast(&read, vec![5, 6]), [5, 6]);
         }
@@ -248,37 +237,33 @@ mod linux {
         #[test]
         fn quota_of_version_2_is_the_tightest_above() {
             let read = files(&[
-                ("/proc/self/cgroup", "0::/a/b\n"),
-                ("/sys/fs/cgroup/a/b/cpu.max", "max 100000\n"),
-                ("/sys/fs/cgroup/a/cpu.max", "250000 100000\n"),
-                ("/sys/fs/cgroup/cpu.max", "800000 100000\n"),
+                ("/proc/self/cgroup", "0::/a/b"),
+                ("/sys/fs/cgroup/a/b/cpu.max", "max 100000"),
+                ("/sys/fs/cgroup/a/cpu.max", "250000 100000"),
+                ("/sys/fs/cgroup/cpu.max", "800000 100000"),
             ]);
             assert_eq!(quota(&read), Some(3));
         }
 
         #[test]
         fn quota_of_version_1() {
-            let group = "5:memory:/x\n4:cpu,cpuacct:/x\n";
-            let read = move |path: &Path| match path.to_str()? {
-                "/proc/self/cgroup" => Some(group.to_owned()),
-                "/sys/fs/cgroup/cpu/cpu.cfs_quota_us" => Some("150000\n".to_owned()),
-                "/sys/fs/cgroup/cpu/cpu.cfs_period_us" => Some("100000\n".to_owned()),
-                "/sys/fs/cgroup/cpu/x/cpu.cfs_quota_us" => Some("-1\n".to_owned()),
-                "/sys/fs/cgroup/cpu/x/cpu.cfs_period_us" => Some("100000\n".to_owned()),
-                _ => None,
-            };
+            let read = files(&[
+                ("/proc/self/cgroup", "5:memory:/x\n4:cpu,cpuacct:/x"),
+                ("/sys/fs/cgroup/cpu/cpu.cfs_quota_us", "150000"),
+                ("/sys/fs/cgroup/cpu/cpu.cfs_period_us", "100000"),
+                ("/sys/fs/cgroup/cpu/x/cpu.cfs_quota_us", "-1"),
+                ("/sys/fs/cgroup/cpu/x/cpu.cfs_period_us", "100000"),
+            ]);
             assert_eq!(quota(&read), Some(2));
         }
 
         #[test]
         fn no_quota() {
-            assert_eq!(
-                quota(&files(&[
-                    ("/proc/self/cgroup", "0::/\n"),
-                    ("/sys/fs/cgroup/cpu.max", "max 100000\n")
-                ])),
-                None
-            );
+            let read = files(&[
+                ("/proc/self/cgroup", "0::/"),
+                ("/sys/fs/cgroup/cpu.max", "max 100000"),
+            ]);
+            assert_eq!(quota(&read), None);
             assert_eq!(quota(&files(&[])), None);
         }
     }

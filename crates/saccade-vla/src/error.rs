@@ -7,6 +7,16 @@ pub(crate) use saccade_vla_checkpoint::{bail, ensure, problem, show_shape};
 use saccade_vla_checkpoint::{printable, show_bytes};
 use saccade_vla_kernels::{IsaError, KernelError, NumThreadsError};
 
+/// Adds a sentence to a list of problems unless something holds: `require!(problems, n > 0; "n is {n}")`.
+macro_rules! require {
+    ($problems:ident, $holds:expr; $($sentence:tt)+) => {
+        if !$holds {
+            $problems.push(format!($($sentence)+));
+        }
+    };
+}
+pub(crate) use require;
+
 /// The result of everything in this crate that can fail.
 pub type Result<T> = std::result::Result<T, Error>;
 

@@ -4,10 +4,10 @@ use std::collections::BTreeMap;
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
-use saccade_vla::files::{CheckpointWriter, Companions, Dtype, PlannedTensor};
+use saccade_vla::files::{Checkpoint, CheckpointWriter, Companions, Dtype, PlannedTensor};
 use saccade_vla::{
-    HeadConfig, MergedTokens, ResizeOptions, ResizeReport, RewriteOptions, merge_future_tokens, resize,
-    resized_config, tensor_shapes,
+    Error, HeadConfig, MergedTokens, ResizeOptions, ResizeReport, RewriteOptions, merge_future_tokens,
+    resize, resized_config, tensor_shapes,
 };
 use serde_json::{Value, json};
 
@@ -20,6 +20,9 @@ const CONFIG: &str = r#"{
   },
   "model_type": "gr00t_n1_5", "extra": [{"num_target_vision_tokens": 4}]
 }"#;
+
+/// The width of its future tokens.
+const WIDTH: usize = 12;
 
 /// A directory of checkpoints, removed at the end.
 struct Directory(PathBuf);
@@ -213,4 +216,34 @@ fn arguments_are_checked() {
         merge_future_tokens(&[], 2, 0, None).unwrap().sources,
         Vec::<Vec<usize>>::new()
     );
+}
+
+#[test]
+fn tokens_that_a_layer_norm_cannot_bear_are_refused() {
+    let directory = Directory::new();
+    directory.write("four", CONFIG, CONFIG, "");
+    let grown = |amount: f64| {
+        let options = ResizeOptions {
+            perturbation: amount,
+            ..ResizeOptions::new(RewriteOptions::default(), 8)
+        };
+        let out = directory.0.join(format!("by {amount}"));
+        let report = resize(&directory.0.join("four"), &out, &options, |_, _| true)?;
+        let tokens = Checkpoint::open(&out)?.read_f32("future_tokens.weight")?;
+        Ok::<_, Error>((report.perturbation_rms, tokens))
+    };
+    let (_, plain) = grown(0.0).unwrap();
+    let (rms, tokens) = grown(0.25).unwrap();
+    let size = plain.iter().map(|value| value.powi(2)).sum::<f32>() / plain.len() as f32;
+    assert!((0.05..0.5).contains(&(rms / f64::from(size.sqrt()))), "{rms}");
+    assert_eq!(tokens[..4 * WIDTH], plain[..4 * WIDTH]);
+    for amount in [-1.0, f64::NAN, f64::INFINITY, 1e38, 1e300, 1e21] {
+        assert!(grown(amount).is_err(), "{amount}");
+    }
+    // What is let through is far from overflowing: the squares of a row's distances from its mean can be summed.
+    for row in grown(2e18).unwrap().1.chunks_exact(WIDTH) {
+        let mean = row.iter().sum::<f32>() / row.len() as f32;
+        let squares: f32 = row.iter().map(|value| (value - mean).powi(2)).sum();
+        assert!(squares.is_finite());
+    }
 }

@@ -178,6 +178,15 @@ mod tests {
         }
     }
 
+    fn raced(before: usize, happens: &dyn Fn()) -> Raced<'_> {
+        let renames = Cell::new(0);
+        Raced {
+            renames,
+            before,
+            happens,
+        }
+    }
+
     /// A directory with an `out` that holds `old`, and one to replace it that holds `new`.
     fn set_up() -> (PathBuf, PathBuf, TemporaryDirectory) {
         let parent = std::env::temp_dir().join(format!("saccade-replace-{}", unique()));
@@ -207,14 +216,9 @@ mod tests {
     fn with_and_without_exchange_the_new_one_has_the_name() {
         for exchanges in [true, false] {
             let (parent, out, new) = set_up();
-            let raced = Raced {
-                renames: Cell::new(0),
-                before: usize::MAX,
-                happens: &|| {},
-            };
             match exchanges {
                 true => replace(&Disk, new, &out).unwrap(),
-                false => replace(&raced, new, &out).unwrap(),
+                false => replace(&raced(usize::MAX, &|| {}), new, &out).unwrap(),
             }
             assert_eq!(names(&parent), ["out"]);
             assert_eq!(names(&out), ["new"]);
@@ -226,12 +230,7 @@ mod tests {
     fn both_are_kept_where_something_takes_the_name_in_between() {
         let (parent, out, new) = set_up();
         let happens = || take_name(&out);
-        let raced = Raced {
-            renames: Cell::new(0),
-            before: 1,
-            happens: &happens,
-        };
-        let error = replace(&raced, new, &out).unwrap_err();
+        let error = replace(&raced(1, &happens), new, &out).unwrap_err();
         let Error::Stranded { old, new, .. } = &error else {
             panic!("{error}");
         };
@@ -253,12 +252,7 @@ mod tests {
         // What is to be renamed is not there any more.
         let path = new.path().to_owned();
         let happens = || fs::remove_dir_all(&path).unwrap();
-        let raced = Raced {
-            renames: Cell::new(0),
-            before: 1,
-            happens: &happens,
-        };
-        let error = replace(&raced, new, &out).unwrap_err();
+        let error = replace(&raced(1, &happens), new, &out).unwrap_err();
         assert!(matches!(error, Error::Output { .. }), "{error}");
         assert_eq!(names(&parent), ["out"]);
         assert_eq!(names(&out), ["old"]);
@@ -269,12 +263,7 @@ mod tests {
     fn a_name_that_became_free_is_taken() {
         let (parent, out, new) = set_up();
         let happens = || fs::rename(&out, parent.join("moved")).unwrap();
-        let raced = Raced {
-            renames: Cell::new(0),
-            before: 0,
-            happens: &happens,
-        };
-        replace(&raced, new, &out).unwrap();
+        replace(&raced(0, &happens), new, &out).unwrap();
         assert_eq!(names(&out), ["new"]);
         assert_eq!(names(&parent), ["moved", "out"]);
         fs::remove_dir_all(parent).unwrap();

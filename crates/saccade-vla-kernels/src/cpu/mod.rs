@@ -116,45 +116,70 @@ mod tests {
 
     #[test]
     fn a_measured_family_gets_what_was_measured() {
-        let genoa = cpu(Vendor::Amd, 25, 17);
-        assert!(genoa.has_fast_bf16_dot() && !genoa.wants_streams());
-        let turin = cpu(Vendor::Amd, 26, 2);
-        assert!(turin.has_fast_bf16_dot());
-        for model in [0x8f, 0xcf] {
-            let rapids = cpu(Vendor::Intel, 6, model);
-            assert!(!rapids.has_fast_bf16_dot() && rapids.wants_streams());
+        for (vendor, family, model, name) in [
+            (Vendor::Intel, 6, 0x8f, "Sapphire Rapids"),
+            (Vendor::Intel, 6, 0xcf, "Emerald Rapids"),
+            (Vendor::Amd, 25, 0x11, "Zen 4"),
+            (Vendor::Amd, 25, 0x61, "Zen 4"),
+            (Vendor::Amd, 25, 0xa0, "Zen 4"),
+            (Vendor::Amd, 26, 0x02, "Zen 5"),
+            (Vendor::Amd, 26, 0x44, "Zen 5"),
+        ] {
+            let cpu = cpu(vendor, family, model);
+            let is_amd = vendor == Vendor::Amd;
+            assert_eq!(
+                (cpu.has_fast_bf16_dot(), cpu.wants_streams()),
+                (is_amd, !is_amd),
+                "{cpu}"
+            );
+            let report = CpuReport::of(&cpu, Err(Refusal::NotThere));
+            assert_eq!(report.rates, format!("{name}, measured"));
+            assert_eq!(report.tiles, "no: this CPU lacks AMX");
+            assert_eq!(
+                report.family,
+                format!("{name} ({})", signature(vendor, family, model))
+            );
         }
-        let report = CpuReport::of(&genoa, Err(Refusal::NotThere));
-        assert_eq!(report.family, "Zen 4 (AuthenticAMD, family 25, model 17)");
-        assert_eq!(report.rates, "Zen 4, measured");
-        assert_eq!(report.tiles, "no: this CPU lacks AMX");
+        let genoa = cpu(Vendor::Amd, 25, 17);
+        assert_eq!(genoa.to_string(), "Zen 4 (AuthenticAMD, family 25, model 17)");
     }
 
     #[test]
     fn another_family_gets_what_its_vendors_newest_gets() {
-        let newest = "the newest family of this vendor that was measured";
-        // Granite Rapids, Ice Lake, and a model that nobody has named.
-        for model in [0xad, 0x6a, 0xfe] {
-            let cpu = cpu(Vendor::Intel, 6, model);
-            assert!(!cpu.has_fast_bf16_dot() && cpu.wants_streams(), "{model}");
-            let report = CpuReport::of(&cpu, Ok(()));
+        for (vendor, family, model, newest) in [
+            // Granite Rapids, Ice Lake, and models that nobody has named.
+            (Vendor::Intel, 6, 0xad, "Emerald Rapids"),
+            (Vendor::Intel, 6, 0x6a, "Emerald Rapids"),
+            (Vendor::Intel, 6, 0xfe, "Emerald Rapids"),
+            (Vendor::Intel, 19, 0x01, "Emerald Rapids"),
+            (Vendor::Amd, 25, 0x01, "Zen 5"),
+            (Vendor::Amd, 26, 0x50, "Zen 5"),
+        ] {
+            let cpu = cpu(vendor, family, model);
+            let is_amd = vendor == Vendor::Amd;
             assert_eq!(
-                report.family,
-                format!("unknown family (GenuineIntel, family 6, model {model})")
+                (cpu.has_fast_bf16_dot(), cpu.wants_streams()),
+                (is_amd, !is_amd),
+                "{cpu}"
             );
-            assert_eq!(report.rates, format!("Emerald Rapids, {newest}"));
+            let report = CpuReport::of(&cpu, Ok(()));
+            assert!(report.family.starts_with("unknown family ("), "{cpu}");
+            assert_eq!(
+                report.rates,
+                format!("{newest}, the newest family of this vendor that was measured")
+            );
             assert_eq!(report.tiles, "yes");
         }
-        let zen6 = cpu(Vendor::Amd, 26, 0x50);
-        assert!(zen6.has_fast_bf16_dot());
-        let report = CpuReport::of(&zen6, Err(Refusal::NotThere));
-        assert_eq!(report.rates, format!("Zen 5, {newest}"));
     }
 
     /// Then what the CPU has is used, as before there was a table.
     #[test]
     fn a_vendor_that_nobody_measured_gets_what_its_cpu_has() {
-        for cpu in [Cpu::new(None), cpu(Vendor::Other, 6, 0x8f)] {
+        for cpu in [
+            Cpu::new(None),
+            cpu(Vendor::Other, 6, 0x8f),
+            cpu(Vendor::Other, 25, 0x11),
+        ] {
             assert!(cpu.has_fast_bf16_dot() && !cpu.wants_streams());
             let report = CpuReport::of(&cpu, Err(Refusal::NotThere));
             assert_eq!(report.rates, "none measured for this vendor");

@@ -11,11 +11,11 @@ use super::sync::{
 };
 
 /// Calls that can have workers at the same time. A call beyond them runs on its own thread only.
-pub(super) const SLOTS: usize = if cfg!(loom) { 1 } else { 8 };
+const SLOTS: usize = if cfg!(loom) { 1 } else { 8 };
 
 /// How long a worker without work spins before it sleeps: about the longest pause between two loops of one forward pass.
 /// Waking a sleeping thread costs some 5 us of the caller's time, and as much again until it runs.
-pub(super) const SPIN: Duration = Duration::from_micros(50);
+const SPIN: Duration = Duration::from_micros(50);
 
 /// The longest time that a caller spins for workers that are inside: a few hundredths of a scheduler's time slice.
 const LONGEST_WAIT: Duration = Duration::from_micros(500);

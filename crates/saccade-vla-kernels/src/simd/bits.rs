@@ -8,13 +8,16 @@ use std::mem::MaybeUninit;
 /// Implement it for such types only.
 pub(crate) unsafe trait Bits: Copy {}
 
-macro_rules! numbers {
-    ($($number:ty),+) => {$(
-        // SAFETY: numbers have no padding, and every bit pattern is one.
-        unsafe impl Bits for $number {}
+/// Implements [`Bits`] for numbers and for vectors of them.
+macro_rules! are_bits {
+    ($($type:ty),+) => {$(
+        // SAFETY: numbers and vectors of them have no padding, and every bit pattern is one.
+        unsafe impl Bits for $type {}
     )+};
 }
-numbers!(u8, u16, u32, i32, i64, f32);
+are_bits!(u8, u16, u32, i32, i64, f32);
+#[cfg(all(any(target_arch = "x86_64", target_arch = "aarch64"), not(saccade_portable)))]
+pub(super) use are_bits;
 
 // SAFETY: arrays have no padding between their elements.
 unsafe impl<T: Bits, const N: usize> Bits for [T; N] {}

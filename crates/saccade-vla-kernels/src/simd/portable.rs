@@ -36,6 +36,16 @@ fn power_of_two(exponent: f32) -> f32 {
     f32::from_bits(biased << 23)
 }
 
+/// Methods of the token, each inlined into the kernel.
+macro_rules! operations {
+    ($(fn $name:ident($($argument:ident: $type:ty),*) $(-> $result:ty)? = $value:expr;)*) => {$(
+        #[inline(always)]
+        fn $name(self, $($argument: $type),*) $(-> $result)? {
+            $value
+        }
+    )*};
+}
+
 impl<const N: usize> Simd for Loops<N> {
     const NAME: &'static str = "portable";
     const LANES: usize = N;
@@ -56,175 +66,84 @@ impl<const N: usize> Simd for Loops<N> {
         kernel.run(self)
     }
 
-    #[inline(always)]
-    fn splat(self, x: f32) -> [f32; N] {
-        [x; N]
-    }
-
-    #[inline(always)]
-    fn add(self, a: [f32; N], b: [f32; N]) -> [f32; N] {
-        zip(a, b, |a, b| a + b)
-    }
-
-    #[inline(always)]
-    fn sub(self, a: [f32; N], b: [f32; N]) -> [f32; N] {
-        zip(a, b, |a, b| a - b)
-    }
-
-    #[inline(always)]
-    fn mul(self, a: [f32; N], b: [f32; N]) -> [f32; N] {
-        zip(a, b, |a, b| a * b)
-    }
-
-    #[inline(always)]
-    fn div(self, a: [f32; N], b: [f32; N]) -> [f32; N] {
-        zip(a, b, |a, b| a / b)
-    }
-
-    #[inline(always)]
-    fn fma(self, a: [f32; N], b: [f32; N], addend: [f32; N]) -> [f32; N] {
-        self.add(self.mul(a, b), addend)
-    }
-
-    #[inline(always)]
-    fn min(self, a: [f32; N], b: [f32; N]) -> [f32; N] {
-        zip(a, b, |a, b| if a < b { a } else { b })
-    }
-
-    #[inline(always)]
-    fn max(self, a: [f32; N], b: [f32; N]) -> [f32; N] {
-        zip(a, b, |a, b| if a > b { a } else { b })
-    }
-
-    #[inline(always)]
-    fn round(self, x: [f32; N]) -> [f32; N] {
-        zip(x, x, |x, _| (x + ROUND) - ROUND)
-    }
-
-    #[inline(always)]
-    fn scale_by_power_of_two(self, x: [f32; N], exponent: [f32; N]) -> [f32; N] {
-        // In two steps, so that neither factor leaves the range of normal numbers.
-        zip(x, exponent, |x, exponent| {
-            let half = (exponent * 0.5 + ROUND) - ROUND;
-            x * power_of_two(half) * power_of_two(exponent - half)
-        })
-    }
-
-    #[inline(always)]
-    fn low_bits_as_exponent(self, x: [f32; N]) -> [f32; N] {
-        x.map(|x| f32::from_bits(x.to_bits() << 23))
-    }
-
-    #[inline(always)]
-    fn replace_where(self, x: [f32; N], probe: [f32; N], value: [f32; N]) -> [f32; N] {
-        let mut out = x;
-        for ((out, probe), value) in out.iter_mut().zip(probe).zip(value) {
-            *out = if probe == value { value } else { *out };
-        }
-        out
-    }
-
-    #[inline(always)]
-    fn reduce_add(self, x: [f32; N]) -> f32 {
-        let mut sums = x;
-        let mut half = N / 2;
-        while half > 0 {
-            for lane in 0..half {
-                sums[lane] += sums[lane + half];
+    operations! {
+        fn splat(x: f32) -> Self::F32 = [x; N];
+        fn add(a: Self::F32, b: Self::F32) -> Self::F32 = zip(a, b, |a, b| a + b);
+        fn sub(a: Self::F32, b: Self::F32) -> Self::F32 = zip(a, b, |a, b| a - b);
+        fn mul(a: Self::F32, b: Self::F32) -> Self::F32 = zip(a, b, |a, b| a * b);
+        fn div(a: Self::F32, b: Self::F32) -> Self::F32 = zip(a, b, |a, b| a / b);
+        fn fma(a: Self::F32, b: Self::F32, addend: Self::F32) -> Self::F32 = zip(zip(a, b, |a, b| a * b), addend, |a, b| a + b);
+        fn min(a: Self::F32, b: Self::F32) -> Self::F32 = zip(a, b, |a, b| if a < b { a } else { b });
+        fn max(a: Self::F32, b: Self::F32) -> Self::F32 = zip(a, b, |a, b| if a > b { a } else { b });
+        fn round(x: Self::F32) -> Self::F32 = zip(x, x, |x, _| (x + ROUND) - ROUND);
+        fn scale_by_power_of_two(x: Self::F32, exponent: Self::F32) -> Self::F32 = {
+            // In two steps, so that neither factor leaves the range of normal numbers.
+            zip(x, exponent, |x, exponent| {
+                let half = (exponent * 0.5 + ROUND) - ROUND;
+                x * power_of_two(half) * power_of_two(exponent - half)
+            })
+        };
+        fn low_bits_as_exponent(x: Self::F32) -> Self::F32 = x.map(|x| f32::from_bits(x.to_bits() << 23));
+        fn replace_where(x: Self::F32, probe: Self::F32, value: Self::F32) -> Self::F32 = {
+            let mut out = x;
+            for ((out, probe), value) in out.iter_mut().zip(probe).zip(value) {
+                *out = if probe == value { value } else { *out };
             }
-            half /= 2;
-        }
-        sums[0]
-    }
-
-    #[inline(always)]
-    fn reduce_max(self, x: [f32; N]) -> f32 {
-        x.into_iter()
-            .fold(f32::NEG_INFINITY, |a, b| if a > b { a } else { b })
-    }
-
-    #[inline(always)]
-    fn splat_i32(self, x: i32) -> [i32; N] {
-        [x; N]
-    }
-
-    #[inline(always)]
-    fn add_i32(self, a: [i32; N], b: [i32; N]) -> [i32; N] {
-        zip(a, b, i32::wrapping_add)
-    }
-
-    #[inline(always)]
-    fn sub_i32(self, a: [i32; N], b: [i32; N]) -> [i32; N] {
-        zip(a, b, i32::wrapping_sub)
-    }
-
-    #[inline(always)]
-    fn mul_i32(self, a: [i32; N], b: [i32; N]) -> [i32; N] {
-        zip(a, b, i32::wrapping_mul)
-    }
-
-    #[inline(always)]
-    fn to_f32(self, x: [i32; N]) -> [f32; N] {
-        x.map(|x| x as f32)
-    }
-
-    #[inline(always)]
-    fn low_halves(self, pairs: [i32; N]) -> [f32; N] {
-        pairs.map(|pair| f32::from_bits((pair as u32) << 16))
-    }
-
-    #[inline(always)]
-    fn high_halves(self, pairs: [i32; N]) -> [f32; N] {
-        pairs.map(|pair| f32::from_bits(pair as u32 & 0xffff_0000))
-    }
-
-    #[inline(always)]
-    fn round_to_bf16(self, x: [f32; N]) -> [f32; N] {
-        x.map(|x| bf16::from_f32(x).to_f32())
-    }
-
-    #[inline(always)]
-    fn to_bf16_pairs(self, first: [f32; N], second: [f32; N]) -> [i32; N] {
-        let bits = [first, second].map(|x| x.map(|x| bf16::from_f32(x).to_bits()));
-        cast(bits)
-    }
-
-    #[inline(always)]
-    fn dot_int8(self, sum: [i32; N], x: [i32; N], w: [i32; N]) -> [i32; N] {
-        let mut sum = sum;
-        for byte in [0, 8, 16, 24] {
-            let products = zip(x, w, |x, w| ((x >> byte) & 255) * ((w << (24 - byte)) >> 24));
-            sum = zip(sum, products, i32::wrapping_add);
-        }
-        sum
-    }
-
-    #[inline(always)]
-    fn load_rest(self, from: &[f32]) -> [f32; N] {
-        let mut out = [0.0; N];
-        for (lane, element) in out.iter_mut().zip(from) {
-            *lane = *element;
-        }
-        out
-    }
-
-    #[inline(always)]
-    fn store_rest(self, x: [f32; N], to: &mut [f32]) {
-        for (element, lane) in to.iter_mut().zip(x) {
-            *element = lane;
-        }
-    }
-
-    #[inline(always)]
-    fn store_bf16(self, x: [f32; N], to: &mut [u16]) {
-        to[..N].copy_from_slice(&x.map(|x| bf16::from_f32(x).to_bits()));
-    }
-
-    #[inline(always)]
-    fn store_bytes(self, x: [f32; N], zero: [i32; N], most: [i32; N], to: &mut [u8]) {
-        let whole = x.map(|x| ((x + ROUND) - ROUND) as i32);
-        let bytes = zip(zip(whole, zero, i32::wrapping_add), most, i32::min);
-        to[..N].copy_from_slice(&bytes.map(|byte| byte as u8));
+            out
+        };
+        fn reduce_add(x: Self::F32) -> f32 = {
+            let mut sums = x;
+            let mut half = N / 2;
+            while half > 0 {
+                for lane in 0..half {
+                    sums[lane] += sums[lane + half];
+                }
+                half /= 2;
+            }
+            sums[0]
+        };
+        fn reduce_max(x: Self::F32) -> f32 = {
+            x.into_iter()
+                .fold(f32::NEG_INFINITY, |a, b| if a > b { a } else { b })
+        };
+        fn splat_i32(x: i32) -> Self::I32 = [x; N];
+        fn add_i32(a: Self::I32, b: Self::I32) -> Self::I32 = zip(a, b, i32::wrapping_add);
+        fn sub_i32(a: Self::I32, b: Self::I32) -> Self::I32 = zip(a, b, i32::wrapping_sub);
+        fn mul_i32(a: Self::I32, b: Self::I32) -> Self::I32 = zip(a, b, i32::wrapping_mul);
+        fn to_f32(x: Self::I32) -> Self::F32 = x.map(|x| x as f32);
+        fn low_halves(pairs: Self::I32) -> Self::F32 = pairs.map(|pair| f32::from_bits((pair as u32) << 16));
+        fn high_halves(pairs: Self::I32) -> Self::F32 = pairs.map(|pair| f32::from_bits(pair as u32 & 0xffff_0000));
+        fn round_to_bf16(x: Self::F32) -> Self::F32 = x.map(|x| bf16::from_f32(x).to_f32());
+        fn to_bf16_pairs(first: Self::F32, second: Self::F32) -> Self::I32 = {
+            let bits = [first, second].map(|x| x.map(|x| bf16::from_f32(x).to_bits()));
+            cast(bits)
+        };
+        fn dot_int8(sum: Self::I32, x: Self::I32, w: Self::I32) -> Self::I32 = {
+            let mut sum = sum;
+            for byte in [0, 8, 16, 24] {
+                let products = zip(x, w, |x, w| ((x >> byte) & 255) * ((w << (24 - byte)) >> 24));
+                sum = zip(sum, products, i32::wrapping_add);
+            }
+            sum
+        };
+        fn load_rest(from: &[f32]) -> Self::F32 = {
+            let mut out = [0.0; N];
+            for (lane, element) in out.iter_mut().zip(from) {
+                *lane = *element;
+            }
+            out
+        };
+        fn store_rest(x: Self::F32, to: &mut [f32]) = {
+            for (element, lane) in to.iter_mut().zip(x) {
+                *element = lane;
+            }
+        };
+        fn store_bf16(x: Self::F32, to: &mut [u16]) = to[..N].copy_from_slice(&x.map(|x| bf16::from_f32(x).to_bits()));
+        fn store_bytes(x: Self::F32, zero: Self::I32, most: Self::I32, to: &mut [u8]) = {
+            let whole = x.map(|x| ((x + ROUND) - ROUND) as i32);
+            let bytes = zip(zip(whole, zero, i32::wrapping_add), most, i32::min);
+            to[..N].copy_from_slice(&bytes.map(|byte| byte as u8));
+        };
     }
 
     #[inline(always)]

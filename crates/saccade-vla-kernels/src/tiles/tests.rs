@@ -1,4 +1,5 @@
-//! Tests of the tiles in software, and of AMX against them.
+//! Tests of the tiles in software, and of AMX against them. That their sums are right is in `tests/software_tiles.rs`, of all layouts in
+//! `tests/attention.rs`.
 
 use std::panic::catch_unwind;
 
@@ -37,10 +38,6 @@ fn pairs(seed: u32, count: usize) -> Vec<u32> {
         .iter()
         .map(|&word| number(word) | number(word >> 16) << 16)
         .collect()
-}
-
-fn elements(word: u32) -> [f64; 2] {
-    [word & 0xffff, word >> 16].map(|bits| bf16::from_bits(bits as u16).to_f64())
 }
 
 /// How many tiles of columns a product of so many rows may have, and whether they are apart in `w`.
@@ -93,42 +90,6 @@ fn product_in(
     }
 }
 
-#[test]
-fn software_tiles_agree_with_float64() {
-    let cases =
-        (1..=MAX_ROWS).flat_map(|rows| layouts(Operation::Bf16, rows).map(move |layout| (rows, layout)));
-    for (rows, layout) in cases {
-        let (columns, steps) = (layout.0, 1 + rows % 3);
-        let (x, w) = (
-            pairs(rows as u32, rows * TILE * steps),
-            pairs(77, columns * TILE * TILE * steps),
-        );
-        let mut sums = vec![7; rows * columns * TILE];
-        let product = product_in(Operation::Bf16, layout, &x, &w, &mut sums);
-        multiply(Software, &[product]);
-        for row in 0..rows {
-            for column in 0..columns * TILE {
-                let products = (0..TILE * steps).flat_map(|k| {
-                    let at = k / TILE * product.w_step
-                        + k % TILE * product.w_stride
-                        + column / TILE * product.w_column
-                        + column % TILE;
-                    let (x, w) = (elements(x[row * TILE * steps + k]), elements(w[at]));
-                    [x[0] * w[0], x[1] * w[1]]
-                });
-                let (exact, size) = products.fold((0.0, 0.0), |(sum, size), product: f64| {
-                    (sum + product, size + product.abs())
-                });
-                let given = f64::from(f32::from_bits(sums[row * columns * TILE + column]));
-                assert!(
-                    (given - exact).abs() <= size * 1e-5,
-                    "{layout:?}, ({row}, {column}): {given}, {exact}"
-                );
-            }
-        }
-    }
-}
-
 /// The order of the sum, by hand: the even elements first, then the odd ones, then both, then what was there.
 #[test]
 fn software_tiles_sum_in_the_order_of_the_hardware() {
@@ -170,36 +131,6 @@ fn software_tiles_round_products_once() {
         let mut sums = [before; TILE];
         add_products(&mut sums, x, &[w; TILE]);
         assert_eq!(sums, [flushed(x.mul_add(w, before)); TILE], "{x} {w} {before}");
-    }
-}
-
-#[test]
-fn software_tiles_of_int8_are_exact() {
-    let (rows, steps) = (29, 2);
-    let (x, w) = (words(3, rows * TILE * steps), words(4, 3 * TILE * TILE * steps));
-    let mut sums = words(5, rows * 3 * TILE);
-    let before = sums.clone();
-    let product = Product {
-        add: true,
-        ..product(Operation::Int8, &x, &w, &mut sums)
-    };
-    multiply(Software, &[product]);
-    for row in 0..rows {
-        for column in 0..3 * TILE {
-            let at = row * 3 * TILE + column;
-            let mut exact = i64::from(before[at].cast_signed());
-            for k in 0..TILE * steps {
-                let (x, w) = (
-                    x[row * TILE * steps + k].to_le_bytes(),
-                    w[k * 3 * TILE + column].to_le_bytes(),
-                );
-                for (x, w) in x.into_iter().zip(w) {
-                    exact += i64::from(x) * i64::from(w.cast_signed());
-                }
-            }
-            // As the hardware, which lets sums wrap.
-            assert_eq!(sums[at].cast_signed(), exact as i32, "({row}, {column})");
-        }
     }
 }
 

@@ -108,19 +108,13 @@ impl Qwen3 {
         workspace: &mut LanguageWorkspace,
         mut record: impl FnMut(usize, Rows<'_>),
     ) -> Result<()> {
-        let LanguageWorkspace {
-            x,
-            y,
-            hidden,
-            attention,
-        } = workspace;
-        let mut x = x.as_rows_mut();
-        let mut y = y.rows(x.num_rows(), x.num_columns())?;
+        let (hidden, attention) = (&mut workspace.hidden, &mut workspace.attention);
+        let mut x = workspace.x.as_rows_mut();
+        let mut y = workspace.y.rows(x.num_rows(), x.num_columns())?;
         for (index, layer) in self.layers.iter().enumerate() {
             check_interrupted()?;
-            layer
-                .input_layernorm
-                .apply(kernels.engine, x.as_rows(), y.reborrow())?;
+            let (norm, mlp_norm) = (&layer.input_layernorm, &layer.post_attention_layernorm);
+            norm.apply(kernels.engine, x.as_rows(), y.reborrow())?;
             let mut sequences: Vec<Causal<'_>> = prompts
                 .iter_mut()
                 .map(|prompt| Causal {
@@ -128,18 +122,12 @@ impl Qwen3 {
                     attended: prompt.attended,
                 })
                 .collect();
-            let sequences = Attended::Causal(&mut sequences);
-            layer.attention.add(
-                kernels,
-                y.as_rows(),
-                Some(rope),
-                sequences,
-                attention,
-                x.reborrow(),
-            )?;
+            let (attended, rope) = (Attended::Causal(&mut sequences), Some(rope));
+            let normed = y.as_rows();
             layer
-                .post_attention_layernorm
-                .apply(kernels.engine, x.as_rows(), y.reborrow())?;
+                .attention
+                .add(kernels, normed, rope, attended, attention, x.reborrow())?;
+            mlp_norm.apply(kernels.engine, x.as_rows(), y.reborrow())?;
             layer.mlp.add(kernels, y.as_rows(), hidden, x.reborrow())?;
             record(index, x.as_rows());
             for (row, added) in deepstack.get(index).into_iter().flatten() {

@@ -2,6 +2,7 @@
 
 use super::head_config::HeadConfig;
 use super::values::MAX_SIZE;
+use crate::error::require;
 
 /// Sizes that a config may say although others determine them.
 pub(super) struct SizesSaidTwice {
@@ -14,9 +15,7 @@ pub(super) struct SizesSaidTwice {
 pub(super) fn contradictions(config: &HeadConfig, twice: &SizesSaidTwice) -> Vec<String> {
     let mut problems = Vec::new();
     let mut equal = |what: &str, given: usize, other: &str, expected: usize| {
-        if given != expected {
-            problems.push(format!("{what} is {given}, but {other} is {expected}"));
-        }
+        require!(problems, given == expected; "{what} is {given}, but {other} is {expected}");
     };
     equal(
         "input_embedding_dim",
@@ -72,18 +71,15 @@ pub(super) fn contradictions(config: &HeadConfig, twice: &SizesSaidTwice) -> Vec
 /// Sizes that no head can be computed with.
 fn impossible_sizes(config: &HeadConfig) -> Vec<String> {
     let mut problems = Vec::new();
-    if config.encoder_action_dim < config.action_dim {
-        problems.push(format!(
-            "pretrained_action_dim is {}, expected at least the {} of the actions that are decoded",
-            config.encoder_action_dim, config.action_dim
-        ));
-    }
-    if config.attend_text_every_n_blocks > 0 && !config.interleave_self_attention {
-        problems.push(
-            "diffusion_model_cfg.interleave_self_attention is false, expected true with use_alternate_vl_dit"
-                .to_owned(),
-        );
-    }
+    require!(
+        problems, config.encoder_action_dim >= config.action_dim;
+        "pretrained_action_dim is {}, expected at least the {} of the actions that are decoded",
+        config.encoder_action_dim, config.action_dim
+    );
+    require!(
+        problems, config.attend_text_every_n_blocks == 0 || config.interleave_self_attention;
+        "diffusion_model_cfg.interleave_self_attention is false, expected true with use_alternate_vl_dit"
+    );
     for (what, size) in [
         (
             "diffusion_model_cfg.num_attention_heads x attention_head_dim",
@@ -94,27 +90,21 @@ fn impossible_sizes(config: &HeadConfig) -> Vec<String> {
             config.state_dim * config.state_history,
         ),
     ] {
-        if size as u64 > MAX_SIZE {
-            problems.push(format!("{what} is {size}, expected at most {MAX_SIZE}"));
-        }
+        require!(problems, size as u64 <= MAX_SIZE; "{what} is {size}, expected at most {MAX_SIZE}");
     }
-    if !config.width.is_multiple_of(2) {
-        problems.push(format!(
-            "input_embedding_dim is {}, expected an even number (half sines, half cosines)",
-            config.width
-        ));
-    }
-    if config.add_pos_embed && config.action_horizon > config.max_positions {
-        problems.push(format!(
-            "action_horizon is {}, more than the {} rows of the position table (max_seq_len)",
-            config.action_horizon, config.max_positions
-        ));
-    }
-    if config.num_steps > config.num_timestep_buckets {
-        problems.push(format!(
-            "num_inference_timesteps is {}, more than num_timestep_buckets {}",
-            config.num_steps, config.num_timestep_buckets
-        ));
-    }
+    require!(
+        problems, config.width.is_multiple_of(2);
+        "input_embedding_dim is {}, expected an even number (half sines, half cosines)", config.width
+    );
+    require!(
+        problems, !config.add_pos_embed || config.action_horizon <= config.max_positions;
+        "action_horizon is {}, more than the {} rows of the position table (max_seq_len)",
+        config.action_horizon, config.max_positions
+    );
+    require!(
+        problems, config.num_steps <= config.num_timestep_buckets;
+        "num_inference_timesteps is {}, more than num_timestep_buckets {}",
+        config.num_steps, config.num_timestep_buckets
+    );
     problems
 }

@@ -34,19 +34,13 @@ impl ActionHead {
     /// The state rows of each observation, to `workspace.state`; of zeros for embodiments whose state does
     /// not act.
     pub(super) fn encode_state(&self, state: &[f32], workspace: &mut Workspace) -> Result<()> {
-        let Workspace {
-            embodiment_ids,
-            zeroed_state,
-            state_hidden,
-            state: encoded,
-            linear,
-            ..
-        } = workspace;
+        let ids = &workspace.embodiment_ids;
         let encoder = &self.layers.state_encoder;
         let state = Rows::new(state, encoder.in_features());
-        let state = self.state_dropout.seen(embodiment_ids, state, zeroed_state)?;
-        let kernels = &mut Kernels::new(self.engine, linear);
-        encoder.apply(kernels, embodiment_ids, state, state_hidden, encoded)?;
+        let state = self.state_dropout.seen(ids, state, &mut workspace.zeroed_state)?;
+        let kernels = &mut Kernels::new(self.engine, &mut workspace.linear);
+        let (hidden, encoded) = (&mut workspace.state_hidden, &mut workspace.state);
+        encoder.apply(kernels, ids, state, hidden, encoded)?;
         Ok(())
     }
 
@@ -103,17 +97,10 @@ impl ActionHead {
             if let Some(guided) = guided {
                 self.guide(guided, pass, workspace)?;
             }
-            let Workspace {
-                x,
-                start,
-                strength,
-                velocity,
-                ..
-            } = &mut *workspace;
-            let (v, x) = (velocity.as_rows(), x.as_rows_mut());
-            steps
-                .integrator
-                .advance(evaluation % in_step, dt, v, strength, x, start)?;
+            let (v, x) = (workspace.velocity.as_rows(), workspace.x.as_rows_mut());
+            let (strength, start) = (&workspace.strength, &mut workspace.start);
+            let stage = evaluation % in_step;
+            steps.integrator.advance(stage, dt, v, strength, x, start)?;
         }
         Ok(())
     }
@@ -127,16 +114,7 @@ impl ActionHead {
         recorded: &mut Recorded<StepBlock>,
         workspace: &mut Workspace,
     ) -> Result<()> {
-        let Workspace {
-            embodiment_ids,
-            input,
-            x,
-            action_hidden,
-            action,
-            linear,
-            ..
-        } = &mut *workspace;
-        let times = &mut input.times;
+        let times = &mut workspace.input.times;
         times.clear();
         reserve("activations", times, pass.context.batch)?;
         let mut last = None;
@@ -149,16 +127,11 @@ impl ActionHead {
                 times.push(Arc::clone(&times[observation - 1]));
             }
         }
-        let kernels = &mut Kernels::new(self.engine, linear);
+        let kernels = &mut Kernels::new(self.engine, &mut workspace.linear);
+        let (ids, x) = (&workspace.embodiment_ids, workspace.x.as_rows());
+        let (hidden, action) = (&mut workspace.action_hidden, &mut workspace.action);
         let encoder = &self.layers.action_encoder;
-        encoder.encode(
-            kernels,
-            embodiment_ids,
-            x.as_rows(),
-            timestep,
-            action_hidden,
-            action,
-        )?;
+        encoder.encode(kernels, ids, x, timestep, hidden, action)?;
         self.assemble_rows(pass, workspace)?;
         self.decode(pass, recorded, workspace)
     }
@@ -166,10 +139,8 @@ impl ActionHead {
     /// `[state, future, action]` for each sequence, or those of them that run, to the transformer's residual
     /// stream.
     pub(super) fn assemble_rows(&self, pass: &Pass<'_>, workspace: &mut Workspace) -> Result<()> {
-        let Workspace {
-            state, action, input, ..
-        } = workspace;
-        let (state, action, width) = (state.as_rows(), action.as_rows(), self.config.width);
+        let (input, width) = (&mut workspace.input, self.config.width);
+        let (state, action) = (workspace.state.as_rows(), workspace.action.as_rows());
         if pass.rows == ActiveRows::Actions {
             input.action.rows(action.num_rows(), width)?.copy_from(action);
             return Ok(());
@@ -202,22 +173,15 @@ impl ActionHead {
         recorded: &mut Recorded<StepBlock>,
         workspace: &mut Workspace,
     ) -> Result<()> {
-        let Workspace {
-            embodiment_ids,
-            input,
-            dit,
-            decoder_hidden,
-            decoded,
-            velocity,
-            linear,
-            ..
-        } = workspace;
-        let kernels = &mut Kernels::new(self.engine, linear);
+        let kernels = &mut Kernels::new(self.engine, &mut workspace.linear);
+        let (input, dit) = (&mut workspace.input, &mut workspace.dit);
         let output = self.layers.dit.forward(kernels, pass, input, recorded, dit)?;
+        let velocity = &mut workspace.velocity;
         let mut velocity = velocity.rows(output.num_rows(), self.config.action_dim)?;
+        let (hidden, decoded) = (&mut workspace.decoder_hidden, &mut workspace.decoded);
         let mut first = 0;
         for decoder in &self.layers.decoders {
-            let decoded = decoder.apply(kernels, embodiment_ids, output, decoder_hidden, decoded)?;
+            let decoded = decoder.apply(kernels, &workspace.embodiment_ids, output, hidden, decoded)?;
             let columns = first..first + decoded.num_columns();
             first = columns.end;
             velocity.reborrow().columns(columns).copy_from(decoded);

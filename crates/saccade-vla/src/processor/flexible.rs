@@ -98,7 +98,7 @@ fn padded<'a>(frame: &Bytes<'_>, height: usize, width: usize) -> Result<Bytes<'a
 ///
 /// # Errors
 /// [`Error::Input`] for a frame that becomes too large; [`Error::Memory`].
-pub(super) fn prepared<'a>(sizes: &Flexible, isa: Isa, name: &str, frame: Bytes<'a>) -> Result<Bytes<'a>> {
+fn prepared<'a>(sizes: &Flexible, isa: Isa, name: &str, frame: Bytes<'a>) -> Result<Bytes<'a>> {
     let frame = match sizes.letter_box {
         true => letter_box(name, frame)?,
         false => frame,
@@ -180,7 +180,7 @@ fn edge_sizes(edge: usize, height: usize, width: usize) -> (usize, usize) {
 
 /// The height and width of a view, whole tokens: the multiples nearest to the frame's sides, between the
 /// least and the greatest area.
-pub(super) fn fitting(sizes: &Flexible, height: usize, width: usize) -> (usize, usize) {
+fn fitting(sizes: &Flexible, height: usize, width: usize) -> (usize, usize) {
     let (least, most) = (sizes.min_pixels as f64, sizes.max_pixels as f64);
     let factor = (sizes.rules.patch_size * sizes.rules.merge) as f64;
     let (height, width) = (height as f64, width as f64);

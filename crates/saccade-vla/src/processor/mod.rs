@@ -8,8 +8,6 @@ mod prompt;
 mod python_text;
 mod settings;
 mod source;
-#[cfg(test)]
-mod tests;
 mod tokenizer;
 mod view;
 

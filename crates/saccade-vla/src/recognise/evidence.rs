@@ -2,7 +2,8 @@
 
 use serde_json::Value;
 
-use super::layout::{CheckpointLayout, Contents, Evidence};
+use super::layout::{Contents, Evidence};
+use super::lerobot;
 use super::sizes::{DECODERS, FUTURE_TOKENS};
 use crate::error::{Error, Result, bail, problem};
 use crate::release::{Feature, Version};
@@ -12,11 +13,8 @@ use crate::release::{Feature, Version};
 /// # Errors
 /// [`Error::Checkpoint`] for evidence that contradicts itself, and for names of GR00T models that are
 /// unknown.
-pub(super) fn recognise_version(
-    contents: &Contents<'_>,
-    layout: &dyn CheckpointLayout,
-) -> Result<(Version, Vec<String>)> {
-    let found = evidence(contents, layout)?;
+pub(super) fn recognise_version(contents: &Contents<'_>) -> Result<(Version, Vec<String>)> {
+    let found = evidence(contents)?;
     let fits = |version: &Version| found.iter().all(|one| one.versions.contains(version));
     let possible: Vec<Version> = Version::all().filter(fits).collect();
     let sentences = found.iter().map(|one| {
@@ -59,10 +57,12 @@ fn usual_version(contents: &Contents<'_>) -> Version {
 }
 
 /// Everything that says something about the version.
-fn evidence(contents: &Contents<'_>, layout: &dyn CheckpointLayout) -> Result<Vec<Evidence>> {
+fn evidence(contents: &Contents<'_>) -> Result<Vec<Evidence>> {
     let (config, tensors) = (contents.config, &contents.tensors);
     let mut found = names_of_models(contents)?;
-    layout.add_evidence(contents, &mut found);
+    if !contents.has_head_config {
+        found.extend(lerobot::evidence(config.top()));
+    }
     let mut add = |feature, what| {
         found.push(Evidence {
             versions: Version::with(feature),

@@ -1,11 +1,10 @@
-//! What a layout of checkpoints is: who writes them, where the head is in them, and where its sizes come
-//! from.
+//! The layouts of checkpoints: who writes them, how they are told apart, and where the head is in them.
 
 use std::path::Path;
 
-use super::sizes::{self, HeadShapes};
-use crate::config::{CheckpointConfig, Object};
-use crate::error::Result;
+use super::lerobot;
+use super::sizes::HeadShapes;
+use crate::config::CheckpointConfig;
 use crate::release::Version;
 
 /// The beginnings of the names of a backbone's tensors: in lerobot's checkpoints, in NVIDIA's, and of a
@@ -15,7 +14,7 @@ pub(crate) const BACKBONE_PREFIXES: [&str; 3] = ["_groot_model.backbone.", "back
 /// What is known about a checkpoint before its version is recognised.
 pub(super) struct Contents<'a> {
     pub config: &'a CheckpointConfig,
-    /// Whether the config holds the head's.
+    /// Whether the config holds the head's; otherwise it is lerobot's.
     pub has_head_config: bool,
     pub tensors: HeadShapes<'a>,
     /// The directory of the weights.
@@ -29,37 +28,59 @@ pub(super) struct Evidence {
 }
 
 /// How one program writes checkpoints.
-pub(super) trait CheckpointLayout: Sync {
+pub(super) struct Layout {
     /// Its name in [`HeadCheckpoint::layout`](super::HeadCheckpoint::layout).
-    fn name(&self) -> &'static str;
-
+    pub name: &'static str,
     /// What the names of the head's tensors begin with, if it is always the same.
-    fn prefix(&self) -> Option<&'static str>;
+    pub prefix: Option<&'static str>,
+    /// Whether a checkpoint of no layout before this one is written so.
+    matches: fn(&Contents<'_>) -> bool,
+}
 
-    /// Whether a checkpoint is written so.
-    fn matches(&self, contents: &Contents<'_>) -> bool;
+/// Keys that a config of a whole model has.
+const BACKBONE_KEYS: [&str; 3] = ["backbone_cfg", "backbone_model_type", "model_name"];
 
-    /// Whether a config is written so and holds no head, whose sizes must then come from elsewhere.
-    ///
-    /// # Errors
-    /// [`Error::Checkpoint`](crate::Error::Checkpoint) for a config of another kind of policy.
-    fn is_without_head(&self, _config: &CheckpointConfig) -> Result<bool> {
-        Ok(false)
-    }
+/// Every layout. The first one that a checkpoint has is its own; the last one fits all.
+pub(super) static LAYOUTS: [Layout; 5] = [
+    // lerobot's of a fork with several action decoders.
+    Layout {
+        name: "fork",
+        prefix: Some(lerobot::PREFIX),
+        matches: |contents| contents.tensors.has_several_decoders(),
+    },
+    Layout {
+        name: "lerobot",
+        prefix: Some(lerobot::PREFIX),
+        matches: |contents| {
+            contents.tensors.prefix == lerobot::PREFIX || contents.config.top().contains_key("type")
+        },
+    },
+    // A head of saccade's own, or a head alone.
+    Layout {
+        name: "saccade",
+        prefix: None,
+        matches: |contents| {
+            let top = contents.config.top();
+            !BACKBONE_KEYS.iter().any(|key| top.contains_key(*key))
+        },
+    },
+    // NVIDIA's with the files of Isaac-GR00T's trainer.
+    Layout {
+        name: "isaac",
+        prefix: Some("action_head."),
+        matches: |contents| contents.directory.join("trainer_state.json").is_file(),
+    },
+    // As NVIDIA publishes them.
+    Layout {
+        name: "nvidia",
+        prefix: Some("action_head."),
+        matches: |_| true,
+    },
+];
 
-    /// Adds what the layout says about the version.
-    fn add_evidence(&self, _clues: &Contents<'_>, _found: &mut Vec<Evidence>) {}
-
-    /// The head's config in the released keys, and everything that it and the tensors disagree on.
-    ///
-    /// # Errors
-    /// [`Error::Checkpoint`](crate::Error::Checkpoint) if there is no head's config, and the tensors do not
-    /// make one.
-    fn head_config(&self, contents: &Contents<'_>, version: Version) -> Result<(Object, Vec<String>)> {
-        Ok(sizes::complete(
-            contents.config.head(),
-            version,
-            &contents.tensors,
-        ))
-    }
+/// The layout of a checkpoint.
+pub(super) fn layout_of(contents: &Contents<'_>) -> &'static Layout {
+    let [.., last] = &LAYOUTS;
+    let found = LAYOUTS.iter().find(|layout| (layout.matches)(contents));
+    found.unwrap_or(last)
 }

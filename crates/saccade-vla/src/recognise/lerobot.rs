@@ -4,93 +4,70 @@
 use saccade_vla_checkpoint::OWN_CONFIG;
 use serde_json::{Map, Value, json};
 
-use super::layout::{CheckpointLayout, Contents, Evidence};
-use super::sizes::{self, BLOCKS, FUTURE_TOKENS, HeadShapes, add_decoders, proved};
+use super::layout::{Contents, Evidence};
+use super::sizes::{BLOCKS, FUTURE_TOKENS, HeadShapes, add_decoders, proved};
 use crate::config::{CheckpointConfig, OWN_KEY, Object, object_in_any};
 use crate::error::{Error, Result, ensure, problem};
 use crate::release::{Feature, Version};
 
-/// lerobot's: everything under `_groot_model.`, the policy's `config.json`.
-pub(super) struct Lerobot {
-    /// Whether it is that of a fork, with several action decoders.
-    pub is_fork: bool,
-}
-
-const PREFIX: &str = "_groot_model.action_head.";
+/// What the names of the head's tensors begin with.
+pub(super) const PREFIX: &str = "_groot_model.action_head.";
 
 /// `type` in lerobot's `config.json` of a GR00T policy.
 const POLICY: &str = "groot";
 
-impl CheckpointLayout for Lerobot {
-    fn name(&self) -> &'static str {
-        if self.is_fork { "fork" } else { "lerobot" }
+/// Whether a config is lerobot's and holds no head, whose sizes must then come from the tensors.
+///
+/// # Errors
+/// [`Error::Checkpoint`] for a config of another kind of policy.
+pub(super) fn is_without_head(config: &CheckpointConfig) -> Result<bool> {
+    match config.top().get("type") {
+        _ if config.is_nested() => Ok(false),
+        None => Ok(false),
+        Some(Value::String(policy)) if policy == POLICY => Ok(true),
+        Some(policy) => Err(Error::Checkpoint(problem!(
+            "config"; "type is {policy}: lerobot's config of another policy, expected \"{POLICY}\""
+        ))),
     }
+}
 
-    fn prefix(&self) -> Option<&'static str> {
-        Some(PREFIX)
-    }
-
-    fn matches(&self, contents: &Contents<'_>) -> bool {
-        match self.is_fork {
-            true => contents.tensors.has_several_decoders(),
-            false => contents.tensors.prefix == PREFIX || contents.config.top().contains_key("type"),
-        }
-    }
-
-    fn is_without_head(&self, config: &CheckpointConfig) -> Result<bool> {
-        match config.top().get("type") {
-            _ if config.is_nested() => Ok(false),
-            None => Ok(false),
-            Some(Value::String(policy)) if policy == POLICY => Ok(true),
-            Some(policy) => Err(Error::Checkpoint(problem!(
-                "config"; "type is {policy}: lerobot's config of another policy, expected \"{POLICY}\""
-            ))),
-        }
-    }
-
-    fn add_evidence(&self, contents: &Contents<'_>, found: &mut Vec<Evidence>) {
-        if contents.has_head_config {
-            return;
-        }
+/// What a config without a head says about the version.
+pub(super) fn evidence(policy: &Object) -> Vec<Evidence> {
+    let mut found = vec![Evidence {
+        versions: Version::all()
+            .filter(|version| version.release().lerobot.is_some())
+            .collect(),
+        what: format!("config.json is lerobot's, type \"{POLICY}\""),
+    }];
+    if let Some(Value::String(base)) = policy.get("base_model_path")
+        && let Some(version) = Version::in_path(base)
+    {
         found.push(Evidence {
-            versions: Version::all()
-                .filter(|version| version.release().lerobot.is_some())
-                .collect(),
-            what: format!("config.json is lerobot's, type \"{POLICY}\""),
+            versions: vec![version],
+            what: format!("base_model_path is \"{base}\""),
         });
-        if let Some(Value::String(base)) = contents.config.top().get("base_model_path")
-            && let Some(version) = Version::in_path(base)
-        {
-            found.push(Evidence {
-                versions: vec![version],
-                what: format!("base_model_path is \"{base}\""),
-            });
-        }
     }
+    found
+}
 
-    fn head_config(&self, contents: &Contents<'_>, version: Version) -> Result<(Object, Vec<String>)> {
-        if contents.has_head_config {
-            return Ok(sizes::complete(
-                contents.config.head(),
-                version,
-                &contents.tensors,
-            ));
-        }
-        let mut head = from_tensors(contents.config.top(), version, &contents.tensors)?;
-        // lerobot refuses a `config.json` with keys that it does not know.
-        if let Some(own) = object_in_any("source", &contents.directory.join(OWN_CONFIG))? {
-            head.insert(OWN_KEY.to_owned(), Value::Object(own));
-        }
-        Ok((head, Vec::new()))
+/// The head's config in the released keys, where the file holds none of it.
+///
+/// # Errors
+/// [`Error::Checkpoint`] if the tensors do not make one.
+pub(super) fn head_config(contents: &Contents<'_>, version: Version) -> Result<Object> {
+    let mut head = from_tensors(contents.config.top(), version, &contents.tensors)?;
+    // lerobot refuses a `config.json` with keys that it does not know.
+    if let Some(own) = object_in_any("source", &contents.directory.join(OWN_CONFIG))? {
+        head.insert(OWN_KEY.to_owned(), Value::Object(own));
     }
+    Ok(head)
 }
 
 /// Widths of an attention head in every published model.
 const DIT_HEAD_DIM: usize = 48;
 const VL_HEAD_DIM: usize = 64;
 
-/// The head's config where the file holds none of it: sizes from the tensors, the rest as the published
-/// models of that version have it.
+/// Sizes from the tensors, the rest as the published models of that version have it.
 fn from_tensors(policy: &Object, version: Version, tensors: &HeadShapes<'_>) -> Result<Object> {
     let number = |key: &str| policy.get(key).and_then(Value::as_u64);
     let sizes = proved(version, tensors);

@@ -8,7 +8,6 @@
 mod evidence;
 mod layout;
 mod lerobot;
-mod nvidia;
 pub(crate) mod sizes;
 
 use std::path::Path;
@@ -20,9 +19,7 @@ use crate::config::{CheckpointConfig, HeadConfig};
 use crate::error::{Error, Result, ensure, problem};
 use evidence::recognise_version;
 pub(crate) use layout::BACKBONE_PREFIXES;
-use layout::{CheckpointLayout, Contents};
-use lerobot::Lerobot;
-use nvidia::{IsaacFineTune, Nvidia, Own};
+use layout::{Contents, LAYOUTS, layout_of};
 use sizes::HeadShapes;
 
 /// A checkpoint, open, and what it is.
@@ -71,7 +68,7 @@ impl HeadCheckpoint {
             None => error.in_file(&path),
         })?;
         let contents = Contents {
-            has_head_config: has_head_config(&config)?,
+            has_head_config: !lerobot::is_without_head(&config)?,
             config: &config,
             tensors: HeadShapes {
                 checkpoint: &checkpoint,
@@ -79,9 +76,11 @@ impl HeadCheckpoint {
             },
             directory,
         };
-        let layout = layout_of(&contents);
-        let (version, evidence) = recognise_version(&contents, layout)?;
-        let (head, problems) = layout.head_config(&contents, version)?;
+        let (version, evidence) = recognise_version(&contents)?;
+        let (head, problems) = match contents.has_head_config {
+            true => sizes::complete(config.head(), version, &contents.tensors),
+            false => (lerobot::head_config(&contents, version)?, Vec::new()),
+        };
         let config_json = Value::Object(head).to_string();
         // What is wrong with the config alone comes first.
         let head = HeadConfig::from_json(&config_json)?;
@@ -92,7 +91,7 @@ impl HeadCheckpoint {
         Ok(Self {
             config: head,
             config_json,
-            layout: layout.name(),
+            layout: layout_of(&contents).name,
             prefix,
             given_config,
             evidence,
@@ -141,42 +140,13 @@ pub struct TensorFacts {
     pub nbytes: u64,
 }
 
-/// Every layout. The first one that a checkpoint has is its own; the last one fits all.
-static LAYOUTS: [&dyn CheckpointLayout; 5] = [
-    &Lerobot { is_fork: true },
-    &Lerobot { is_fork: false },
-    &Own,
-    &IsaacFineTune,
-    &Nvidia,
-];
-
-/// The layout of a checkpoint.
-fn layout_of(contents: &Contents<'_>) -> &'static dyn CheckpointLayout {
-    let [.., last] = LAYOUTS;
-    let found = LAYOUTS.into_iter().find(|layout| layout.matches(contents));
-    found.unwrap_or(last)
-}
-
-/// Whether a config holds a head's.
-///
-/// # Errors
-/// [`Error::Checkpoint`] for a config of another kind of policy.
-fn has_head_config(config: &CheckpointConfig) -> Result<bool> {
-    for layout in LAYOUTS {
-        if layout.is_without_head(config)? {
-            return Ok(false);
-        }
-    }
-    Ok(true)
-}
-
 /// What the names of the head's tensors begin with: empty if no layout's prefix is used.
 ///
 /// # Errors
 /// [`Error::Checkpoint`] if there are two heads in one checkpoint, or a backbone alone.
 fn head_prefix(checkpoint: &Checkpoint) -> Result<&'static str> {
     let mut used: Vec<&str> = Vec::new();
-    for prefix in LAYOUTS.iter().filter_map(|layout| layout.prefix()) {
+    for prefix in LAYOUTS.iter().filter_map(|layout| layout.prefix) {
         if !used.contains(&prefix) && checkpoint.names().any(|name| name.starts_with(prefix)) {
             used.push(prefix);
         }

@@ -3,6 +3,8 @@
 // Each test uses some of it.
 #![allow(dead_code)]
 
+pub mod interventions;
+
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 

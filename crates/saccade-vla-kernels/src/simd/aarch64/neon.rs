@@ -10,17 +10,10 @@ use std::arch::aarch64::{
 use std::arch::is_aarch64_feature_detected;
 
 use super::instructions::{bfcvtn, bfdot, bfdot_lane, prefetch};
-use crate::simd::bits::{Bits, cast, write};
+use crate::simd::bits::{Bits, are_bits, cast, write};
 use crate::simd::{Kernel, Simd, forward, functions, token};
 
-// SAFETY: a vector has no padding, and all bits are values of its lanes.
-unsafe impl Bits for float32x4_t {}
-// SAFETY: as of float32x4_t.
-unsafe impl Bits for int32x4_t {}
-// SAFETY: as of float32x4_t.
-unsafe impl Bits for uint16x4_t {}
-// SAFETY: as of float32x4_t.
-unsafe impl Bits for uint16x8_t {}
+are_bits!(float32x4_t, int32x4_t, uint16x4_t, uint16x8_t);
 
 /// A token of these vectors, with what it adds to NEON.
 macro_rules! neon {

@@ -8,22 +8,11 @@ use std::arch::x86_64::{
     _MM_HINT_T1, _mm_prefetch,
 };
 
-use super::bits::Bits;
+use super::bits::{Bits, are_bits};
 
 const NEAREST: i32 = _MM_FROUND_TO_NEAREST_INT | _MM_FROUND_NO_EXC;
 
-// SAFETY: a vector has no padding, and all bits are values of its lanes.
-unsafe impl Bits for __m128i {}
-// SAFETY: as of __m128i.
-unsafe impl Bits for __m256 {}
-// SAFETY: as of __m128i.
-unsafe impl Bits for __m256i {}
-// SAFETY: as of __m128i.
-unsafe impl Bits for __m512 {}
-// SAFETY: as of __m128i.
-unsafe impl Bits for __m512i {}
-// SAFETY: as of __m128i.
-unsafe impl Bits for __m512bh {}
+are_bits!(__m128i, __m256, __m256i, __m512, __m512i, __m512bh);
 
 /// Prefetches into the second-level cache.
 #[inline(always)]

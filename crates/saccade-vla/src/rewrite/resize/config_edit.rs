@@ -6,7 +6,7 @@ use serde_json::Value;
 use serde_json::value::RawValue;
 
 use crate::config::{HEAD_KEY, HeadConfig, OWN_KEY};
-use crate::error::{Error, Problem, Result, ensure};
+use crate::error::{Error, Result, ensure};
 use crate::release::Feature;
 use crate::rewrite::json_edit::{Found, entry, find, span};
 
@@ -55,31 +55,19 @@ struct HeadObject {
 /// [`Error::Checkpoint`] for a version without future tokens, a head that has none, and numbers that contradict each other;
 /// [`Error::Input`] for a count out of range.
 pub(super) fn config_edit(config: &HeadConfig, given: &str, count: usize) -> Result<ConfigEdit> {
-    let bad = |argument, problem: String| Err(Error::Checkpoint(Problem::new(argument, problem)));
     let before = config.num_future_tokens;
-    if !config.version.has(Feature::FutureTokens) {
-        return bad(
-            "source",
-            format!(
-                "GR00T {} has no future tokens, so there is no number of them to change",
-                config.version
-            ),
-        );
-    }
-    if before == 0 {
-        return bad(
-            "source",
-            "it has no future tokens: there is nothing to copy, and new ones would have to be trained"
-                .to_owned(),
-        );
-    }
+    ensure!(
+        config.version.has(Feature::FutureTokens), Checkpoint, "source";
+        "GR00T {} has no future tokens, so there is no number of them to change", config.version
+    );
+    ensure!(
+        before != 0, Checkpoint, "source";
+        "it has no future tokens: there is nothing to copy, and new ones would have to be trained"
+    );
     ensure!(count <= MAX_TOKENS, Input, "num_future_tokens"; expected "at most {MAX_TOKENS}"; got "{count}");
-    if before > MAX_TOKENS {
-        return bad(
-            "source",
-            format!("it has {before} future tokens, expected at most {MAX_TOKENS}"),
-        );
-    }
+    ensure!(
+        before <= MAX_TOKENS, Checkpoint, "source"; "it has {before} future tokens, expected at most {MAX_TOKENS}"
+    );
     let mut found = Vec::new();
     let whole: &RawValue = serde_json::from_str(given).map_err(|source| Error::json("config", source))?;
     find("", whole, &mut found)?;
@@ -89,12 +77,10 @@ pub(super) fn config_edit(config: &HeadConfig, given: &str, count: usize) -> Res
         .filter(|place| serde_json::from_str::<usize>(place.value.get()).ok() != Some(before))
         .map(|place| format!("{} is {}", place.path, place.value.get()))
         .collect();
-    if !others.is_empty() {
-        return bad(
-            "config",
-            format!("{}, but the head has {before} future tokens", others.join("; ")),
-        );
-    }
+    ensure!(
+        others.is_empty(), Checkpoint, "config";
+        "{}, but the head has {before} future tokens", others.join("; ")
+    );
     let head = found
         .iter()
         .find(|place| place.path == HEAD_KEY)
