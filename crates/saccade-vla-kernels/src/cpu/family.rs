@@ -104,20 +104,19 @@ pub(super) fn newest(vendor: Vendor) -> Option<&'static Family> {
 
 #[cfg(test)]
 mod tests {
+    use super::super::signature::signature;
     use super::*;
 
     #[test]
     fn no_two_families_share_a_model() {
-        for (index, one) in FAMILIES.iter().enumerate() {
-            for other in FAMILIES[index + 1..]
-                .iter()
-                .filter(|other| (other.vendor, other.family) == (one.vendor, one.family))
-            {
-                let apart = one.models.iter().all(|a| {
-                    let touches = |b: &&RangeInclusive<u32>| a.start() <= b.end() && b.start() <= a.end();
-                    !other.models.iter().any(|b| touches(&b))
-                });
-                assert!(apart, "{} and {}", one.name, other.name);
+        for one in FAMILIES {
+            for model in one.models.iter().cloned().flatten() {
+                let found = of(signature(one.vendor, one.family, model));
+                assert_eq!(
+                    found.map(|family| family.name),
+                    Some(one.name),
+                    "model {model:#x}"
+                );
             }
         }
     }

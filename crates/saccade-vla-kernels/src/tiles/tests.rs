@@ -8,7 +8,7 @@ use half::bf16;
 use super::software::{Registers, add_products, bf16_row, flushed};
 use super::*;
 
-/// Does products of operands that [`product_in`] was given, or parts of them.
+/// Does products of operands that [`product`] was given, or parts of them.
 fn multiply<U: TileUnit>(unit: U, products: &[Product]) {
     // SAFETY: the operands have the sizes of the products; no other session is open.
     unsafe {
@@ -53,13 +53,8 @@ fn layouts(operation: Operation, rows: usize) -> impl Iterator<Item = (usize, bo
     })
 }
 
-/// By three tiles next to each other.
-fn product(operation: Operation, x: &[u32], w: &[u32], sums: &mut [u32]) -> Product {
-    product_in(operation, (3, false), x, w, sums)
-}
-
 /// By as many tiles, next to each other or one after the other.
-fn product_in(
+fn product(
     operation: Operation,
     (columns, apart): (usize, bool),
     x: &[u32],
@@ -148,7 +143,7 @@ fn software_tiles_give_a_row_the_same_bits_in_any_product() {
         let of = |rows: std::ops::Range<usize>| {
             let mut sums = vec![0; rows.len() * width];
             let x = &x[rows.start * TILE * steps..rows.end * TILE * steps];
-            let whole = product_in(operation, layout, x, &w, &mut sums);
+            let whole = product(operation, layout, x, &w, &mut sums);
             // The last step apart.
             let most = Product {
                 steps: steps - 1,
@@ -210,7 +205,7 @@ fn assert_equal(operation: Operation, rows: usize, steps: usize, x: &[u32], w: &
                 columns,
                 add,
                 sums_stride: MAX_COLUMN_TILES * TILE,
-                ..product(operation, x, w, sums)
+                ..product(operation, (3, false), x, w, sums)
             };
             if !apart {
                 return product;

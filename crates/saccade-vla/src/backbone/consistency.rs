@@ -1,6 +1,7 @@
 //! What the sizes of a backbone must be to each other.
 
-use super::config::{BackboneConfig, Tower};
+use super::config::{BackboneConfig, CHANNELS, Tower};
+use crate::config::MAX_SIZE;
 use crate::error::require;
 
 /// Everything in which the sizes do not fit each other.
@@ -16,6 +17,14 @@ pub(super) fn contradictions(config: &BackboneConfig) -> Vec<String> {
             problems, size.is_multiple_of(vision.token_size());
             "vision_config: expected an image_size of whole tokens of {} pixels, got {size}", vision.token_size()
         );
+    }
+    let patch = vision.patch_size.saturating_pow(2).saturating_mul(CHANNELS);
+    let queries = language.num_heads.saturating_mul(language.head_dim);
+    for (what, size) in [
+        ("vision_config: 3 x patch_size x patch_size", patch),
+        ("text_config: num_attention_heads x head_dim", queries),
+    ] {
+        require!(problems, size as u64 <= MAX_SIZE; "{what} is {size}, expected at most {MAX_SIZE}");
     }
     let positions = vision.num_positions;
     require!(

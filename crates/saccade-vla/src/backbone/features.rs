@@ -135,11 +135,9 @@ impl BackboneFeatures {
     /// # Panics
     /// If there is no such prompt.
     pub fn views(&self, prompt: usize) -> impl Iterator<Item = &[usize]> {
-        let EncodedPrompt {
-            views, image_tokens, ..
-        } = &*self.prompts[prompt];
-        let mut left = image_tokens.as_slice();
-        views.iter().map(move |view| {
+        let prompt = &self.prompts[prompt];
+        let mut left = prompt.image_tokens.as_slice();
+        prompt.views.iter().map(move |view| {
             let (own, rest) = left.split_at(view.num_tokens);
             left = rest;
             own

@@ -172,7 +172,7 @@ impl Reader<'_> {
                 if is_fixed {
                     let image_size = self.size(VISION, "image_size");
                     config.image_size = Some(image_size);
-                    config.num_positions = (image_size / patch_size) * (image_size / patch_size);
+                    config.num_positions = (image_size / patch_size).saturating_pow(2);
                 } else {
                     config.num_positions = self.size(VISION, "num_patches");
                 }
@@ -186,7 +186,7 @@ impl Reader<'_> {
             TowerKind::Qwen3Vl => {
                 let frames = self.within(VISION, "temporal_patch_size", 1..=16);
                 config.tower = Tower::Qwen3Vl {
-                    patch_elements: CHANNELS * frames * patch_size * patch_size,
+                    patch_elements: (CHANNELS * frames).saturating_mul(patch_size.saturating_pow(2)),
                     frames,
                 };
                 config.num_positions = self.size(VISION, "num_position_embeddings");

@@ -73,34 +73,21 @@ impl Recognised {
     /// the pooling head of SigLIP, the twin of the embeddings, layers of the language model beyond the last
     /// one that is kept, and its norm where features are not normed.
     pub(super) fn is_unused(&self, name: &str) -> bool {
-        let Names {
-            vision,
-            language,
-            lm_head,
-            ..
-        } = self.names.parts;
-        let below = |name: &str, path: &str| {
-            let rest = name.strip_prefix(path)?.strip_prefix('.')?;
-            Some(rest.to_owned())
-        };
-        if below(name, lm_head).as_deref() == Some("weight") {
+        fn below<'a>(name: &'a str, path: &str) -> Option<&'a str> {
+            name.strip_prefix(path)?.strip_prefix('.')
+        }
+        let names = &self.names.parts;
+        let of_head = |rest: &str| names.connector.is_some() && rest.starts_with("head.");
+        if below(name, names.lm_head) == Some("weight") || below(name, names.vision).is_some_and(of_head) {
             return true;
         }
-        if self.names.parts.connector.is_some()
-            && below(name, vision).is_some_and(|rest| rest.starts_with("head."))
-        {
-            return true;
-        }
-        let Some(rest) = below(name, language) else {
+        let Some(rest) = below(name, names.language) else {
             return false;
         };
         if rest == "norm.weight" {
             return !self.config.language.has_final_norm;
         }
-        let layer = rest
-            .strip_prefix("layers.")
-            .and_then(|rest| rest.split('.').next());
-        let layer = layer.and_then(|layer| layer.parse::<usize>().ok());
+        let layer = below(rest, "layers").and_then(|rest| rest.split('.').next()?.parse::<usize>().ok());
         layer.is_some_and(|layer| layer >= self.config.language.num_layers)
     }
 

@@ -21,14 +21,14 @@ pub(super) fn contradictions(config: &HeadConfig, twice: &SizesSaidTwice) -> Vec
         "input_embedding_dim",
         config.width,
         "diffusion_model_cfg.num_attention_heads x attention_head_dim",
-        config.num_heads * config.head_dim,
+        config.num_heads.saturating_mul(config.head_dim),
     );
     if config.vl_num_layers > 0 {
         equal(
             "backbone_embedding_dim",
             config.context_dim,
             "vl_self_attention_cfg.num_attention_heads x attention_head_dim",
-            config.vl_num_heads * config.vl_head_dim,
+            config.vl_num_heads.saturating_mul(config.vl_head_dim),
         );
     }
     let cross = "diffusion_model_cfg.cross_attention_dim";
@@ -87,7 +87,7 @@ fn impossible_sizes(config: &HeadConfig) -> Vec<String> {
         ),
         (
             "max_state_dim x state_history_length",
-            config.state_dim * config.state_history,
+            config.state_dim.saturating_mul(config.state_history),
         ),
     ] {
         require!(problems, size as u64 <= MAX_SIZE; "{what} is {size}, expected at most {MAX_SIZE}");

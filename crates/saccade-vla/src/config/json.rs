@@ -131,7 +131,7 @@ impl<'a> Reader<'a> {
         // The width appears twice; upstream's default for one of them fits a single size of the other.
         let width = match head.get("input_embedding_dim") {
             Some(_) => self.size(head, "input_embedding_dim"),
-            None => num_heads * head_dim,
+            None => num_heads.saturating_mul(head_dim),
         };
         let cross_dim = dit.given("cross_attention_dim");
         let context_dim = match version.has(Feature::ContextWidth) {

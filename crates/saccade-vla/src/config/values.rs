@@ -12,7 +12,8 @@ use crate::error::{Error, Problem, Result, bail};
 /// A JSON object.
 pub(crate) type Object = Map<String, Value>;
 
-/// No size in a config is larger: products of three of them stay far below `u64::MAX`.
+/// No size in a config is larger: products of three of them stay far below `u64::MAX`. Those of two may be
+/// more than a `usize` of 32 bits, so they saturate, and are then refused as too large.
 pub(crate) const MAX_SIZE: u64 = 1 << 20;
 
 /// No model has more layers; the names of their tensors are written out.

@@ -207,19 +207,16 @@ impl Attention {
         epilogue: Epilogue,
         out: RowsMut<'_>,
     ) -> Result<()> {
-        let CrossKeys {
-            caches, subset, bias, ..
-        } = keys;
+        let (caches, subset, bias) = (keys.caches, keys.subset, keys.bias);
         let mut probabilities = keys.probabilities;
         self.queries(kernels, y, workspace)?;
         let (q, mut mixed) = (workspace.q.as_rows(), workspace.mixed.as_rows_mut());
         // A shared bias is one sequence's, so each sequence is then a call of its own; otherwise those that
         // read the same keys share one.
         let of_group = y.count / caches.len();
-        let together = if matches!(bias, Bias::Shared(_)) {
-            1
-        } else {
-            of_group
+        let together = match bias {
+            Bias::Shared(_) => 1,
+            _ => of_group,
         };
         for first in (0..y.count).step_by(together) {
             let group = first / of_group;
@@ -228,11 +225,8 @@ impl Attention {
             let logits = [self.num_heads, rows.len(), cache.len()];
             let bias = bias.of(group, positions, logits, &mut workspace.bias)?;
             let all = subset.map_or(cache.len(), |subset| subset.all);
-            let own = of_sequence(
-                &mut probabilities,
-                first / together,
-                [self.num_heads, rows.len(), all],
-            );
+            let recorded = [self.num_heads, rows.len(), all];
+            let own = of_sequence(&mut probabilities, first / together, recorded);
             let (q, mixed) = (q.rows(rows.clone()), mixed.reborrow().rows(rows));
             match (positions, own) {
                 (Some(positions), Some(own)) => {
@@ -255,9 +249,7 @@ impl Attention {
         workspace: &mut AttentionWorkspace,
         x: RowsMut<'_>,
     ) -> Result<()> {
-        let SelfKeys {
-            source, held, bias, ..
-        } = keys;
+        let (source, held, bias) = (keys.source, keys.held, keys.bias);
         let mut probabilities = keys.probabilities;
         let engine = kernels.engine;
         self.queries(kernels, y, workspace)?;

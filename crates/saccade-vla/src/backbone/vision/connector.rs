@@ -82,26 +82,24 @@ impl Connector {
         let ConnectorWorkspace { normed, hidden } = workspace;
         let x = match &self.norm {
             Some(norm) => {
-                let normed_rows = normed.rows(x.num_rows(), x.num_columns())?;
-                norm.apply(kernels.engine, x, normed_rows)?;
-                normed
-                    .as_rows()
-                    .joined(self.first.in_features() / x.num_columns())
+                norm.apply(kernels.engine, x, normed.rows(x.num_rows(), x.num_columns())?)?;
+                let patches_of_token = self.first.in_features() / x.num_columns();
+                normed.as_rows().joined(patches_of_token)
             }
             None => x,
         };
-        let last = self.second.as_ref().unwrap_or(&self.first);
+        let (last, x) = match &self.second {
+            Some(second) => {
+                let rows = hidden.rows(x.num_rows(), self.first.out_features())?;
+                self.first.apply(kernels, x, Epilogue::GeluErf, rows)?;
+                (second, hidden.as_rows())
+            }
+            None => (&self.first, x),
+        };
         let len = product("tokens of views", &[x.num_rows(), last.out_features()])?;
         let mut tokens = filled("tokens of views", len, 0.0)?;
         let out = RowsMut::new(&mut tokens, last.out_features());
-        if self.second.is_none() {
-            self.first.apply(kernels, x, Epilogue::Store, out)?;
-        } else {
-            let mut hidden = hidden.rows(x.num_rows(), self.first.out_features())?;
-            self.first
-                .apply(kernels, x, Epilogue::GeluErf, hidden.reborrow())?;
-            last.apply(kernels, hidden.as_rows(), Epilogue::Store, out)?;
-        }
+        last.apply(kernels, x, Epilogue::Store, out)?;
         Ok(tokens)
     }
 }

@@ -109,13 +109,9 @@ impl VisionTower for Qwen3Vl {
             vectors.copy_from(Rows::new(view.pixels, elements));
             let [by_row, by_column]: [Vec<Taps>; 2] = view.grid.map(|count| evenly_spaced(side, count));
             let of_view = patch_places(self.config.merge, view.grid)?;
-            for ([row, column], x) in of_view.iter().zip(&mut rows) {
-                interpolate(
-                    self.positions.rows(),
-                    side,
-                    [&by_row[*row], &by_column[*column]],
-                    x,
-                );
+            for (&[row, column], x) in of_view.iter().zip(&mut rows) {
+                let taps = [&by_row[row], &by_column[column]];
+                interpolate(self.positions.rows(), side, taps, x);
             }
             places.extend(of_view);
         }

@@ -180,22 +180,15 @@ impl VisionTower for Siglip {
         if self.config.merge == 1 {
             return Ok((y, self.connector.tokens(kernels, y, connector)?));
         }
-        let mut tokens = workspace
-            .joined
-            .rows(x.num_rows() / patches_of_token, patches_of_token * width)?;
+        let count = x.num_rows() / patches_of_token;
+        let mut tokens = workspace.joined.rows(count, patches_of_token * width)?;
         let mut first = 0;
         for view in views {
             let patches = first..first + view.num_patches();
             let own = first / patches_of_token..patches.end / patches_of_token;
             first = patches.end;
-            let tokens = tokens.reborrow().rows(own);
-            pixel_shuffle(
-                self.config.merge,
-                self.patches,
-                view.grid,
-                y.rows(patches),
-                tokens,
-            );
+            let (y, tokens) = (y.rows(patches), tokens.reborrow().rows(own));
+            pixel_shuffle(self.config.merge, self.patches, view.grid, y, tokens);
         }
         Ok((y, self.connector.tokens(kernels, tokens.as_rows(), connector)?))
     }

@@ -2,10 +2,9 @@
 
 use std::fmt;
 
-use serde::de::{Deserialize, Deserializer, Error as _, IgnoredAny, SeqAccess, Unexpected, Visitor};
 use serde_json::{Value, json};
 
-use super::parts::{Added, Ids, PATTERN, Parts, Problems};
+use super::parts::{Added, Ids, PATTERN, Parts, Problems, pair};
 use crate::error::{Error, Result};
 
 #[derive(serde::Deserialize)]
@@ -44,41 +43,11 @@ struct Model {
 }
 
 /// A merge: two strings, or, in older files, one with a space between them.
-struct Merge(String, String);
-
-impl<'de> Deserialize<'de> for Merge {
-    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> std::result::Result<Self, D::Error> {
-        struct Pair;
-        impl<'de> Visitor<'de> for Pair {
-            type Value = Merge;
-
-            fn expecting(&self, formatter: &mut fmt::Formatter) -> fmt::Result {
-                formatter.write_str("two tokens")
-            }
-
-            fn visit_str<E: serde::de::Error>(self, line: &str) -> std::result::Result<Merge, E> {
-                match line.split_once(' ') {
-                    Some((left, right)) if !right.contains(' ') => {
-                        Ok(Merge(left.to_owned(), right.to_owned()))
-                    }
-                    _ => Err(E::invalid_value(Unexpected::Str(line), &self)),
-                }
-            }
-
-            fn visit_seq<A: SeqAccess<'de>>(self, mut pair: A) -> std::result::Result<Merge, A::Error> {
-                let mut token = |index| {
-                    let token = pair.next_element::<String>()?;
-                    token.ok_or_else(|| A::Error::invalid_length(index, &Pair))
-                };
-                let merge = Merge(token(0)?, token(1)?);
-                match pair.next_element::<IgnoredAny>()? {
-                    None => Ok(merge),
-                    Some(_) => Err(A::Error::invalid_length(3, &self)),
-                }
-            }
-        }
-        deserializer.deserialize_any(Pair)
-    }
+#[derive(serde::Deserialize)]
+#[serde(untagged, expecting = "expected two tokens")]
+enum Merge {
+    Pair(String, String),
+    Line(String),
 }
 
 /// The parts of a `tokenizer.json`.
@@ -91,14 +60,14 @@ pub(super) fn parse(text: &str) -> Result<Parts> {
     check_kind(&file, &mut problems);
     problems.into_result()?;
     let added = file.added_tokens.into_iter();
+    let merges = file.model.merges.into_iter().map(|merge| match merge {
+        Merge::Pair(left, right) => (left, right),
+        // A line that is no pair is refused with those whose tokens are unknown.
+        Merge::Line(line) => pair(&line).unwrap_or((line, String::new())),
+    });
     Ok(Parts {
         vocab: file.model.vocab.0,
-        merges: file
-            .model
-            .merges
-            .into_iter()
-            .map(|merge| (merge.0, merge.1))
-            .collect(),
+        merges: merges.collect(),
         added: added.map(|added| (added.id, added.token)).collect(),
     })
 }

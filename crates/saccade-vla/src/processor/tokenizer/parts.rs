@@ -146,6 +146,12 @@ impl Parts {
     }
 }
 
+/// The two tokens of a line, with one space between them.
+pub(super) fn pair(line: &str) -> Option<(String, String)> {
+    let (left, right) = line.split_once(' ')?;
+    (!right.contains(' ')).then(|| (left.to_owned(), right.to_owned()))
+}
+
 /// What is wrong with a tokenizer.
 #[derive(Default)]
 pub(super) struct Problems {

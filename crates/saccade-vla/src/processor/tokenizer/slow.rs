@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use serde::Deserialize;
 use tokenizers::models::bpe::Merges;
 
-use super::parts::{Added, Ids, Parts, Problems};
+use super::parts::{Added, Ids, Parts, Problems, pair};
 use crate::error::{Error, Result};
 
 /// What is read of `tokenizer_config.json`.
@@ -91,14 +91,10 @@ fn parse_merges(text: &str, problems: &mut Problems) -> Merges {
         if line.is_empty() || (index == 0 && line.starts_with("#version")) {
             continue;
         }
-        match line.split_once(' ') {
-            Some((left, right)) if !right.contains(' ') => merges.push((left.to_owned(), right.to_owned())),
-            _ => problems.add(|| {
-                format!(
-                    "merges.txt: line {}: expected two tokens, got {line:?}",
-                    index + 1
-                )
-            }),
+        let number = index + 1;
+        match pair(line) {
+            Some(pair) => merges.push(pair),
+            None => problems.add(|| format!("merges.txt: line {number}: expected two tokens, got {line:?}")),
         }
     }
     merges

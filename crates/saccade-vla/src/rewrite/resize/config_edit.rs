@@ -87,10 +87,9 @@ pub(super) fn config_edit(config: &HeadConfig, given: &str, count: usize) -> Res
         .map(|place| place.value)
         .or_else(|| (!found.iter().any(|place| place.path == "type")).then_some(whole));
     let in_head = |key: &str, head: &RawValue| {
-        let path = if std::ptr::eq(head, whole) {
-            key.to_owned()
-        } else {
-            format!("{HEAD_KEY}.{key}")
+        let path = match std::ptr::eq(head, whole) {
+            true => key.to_owned(),
+            false => format!("{HEAD_KEY}.{key}"),
         };
         found.iter().find(|place| place.path == path)
     };
