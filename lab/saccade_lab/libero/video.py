@@ -27,7 +27,7 @@ class EpisodeVideo:
 
     def __init__(self, writer: VideoWriter) -> None:
         self._writer = writer
-        self._font = ImageFont.load_default(size=14)
+        self._fonts = [ImageFont.load_default(size=size) for size in range(14, 6, -1)]
 
     def __call__(self, environment: LiberoEnvironment, episode: Episode) -> None:
         """Adds a picture at every second step, and at the last one of a success."""
@@ -38,9 +38,11 @@ class EpisodeVideo:
             view = Image.fromarray(picture).resize((VIEW, VIEW), Image.Resampling.BOX)
             canvas.paste(view, (place * VIEW, TITLE_HEIGHT))
         draw = ImageDraw.Draw(canvas)
-        draw.text((8, 7), environment.instruction, fill=INK, font=self._font)
+        words, room = environment.instruction, 2 * VIEW - 60
+        font = next((one for one in self._fonts if one.getlength(words) <= room), self._fonts[-1])
+        draw.text((8, 7), words, fill=INK, font=font)
         if episode.success:
-            draw.text((2 * VIEW - 8, 7), "done", fill=GREEN, font=self._font, anchor="ra")
+            draw.text((2 * VIEW - 8, 7), "done", fill=GREEN, font=self._fonts[0], anchor="ra")
         self._writer.append(np.asarray(canvas))
 
 
