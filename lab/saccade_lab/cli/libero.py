@@ -16,7 +16,7 @@ from saccade.cli import EXIT_INTERRUPTED, EXIT_OK, output
 from saccade.errors import SaccadeError
 from saccade_lab import flags as lab_flags
 from saccade_lab.extras import LAB, require
-from saccade_lab.files import writable_directory
+from saccade_lab.files import path_text, writable_directory
 from saccade_lab.parallel import Lost, Workers, each
 from saccade_lab.parallel.arguments import add_arguments as add_worker_arguments
 from saccade_lab.parallel.arguments import workers_of
@@ -26,6 +26,9 @@ if TYPE_CHECKING:
     from saccade_lab.libero.episodes import Episodes, Rolled
     from saccade_lab.libero.policy import LiberoPolicy
     from saccade_lab.libero.results import Results
+
+#: Options that may be paths of files.
+FILES = ("data_config", "tokenizer")
 
 HELP = "run a policy on LIBERO and report how often it succeeds, by a released protocol"
 EXTRAS = LAB
@@ -109,7 +112,7 @@ class Session:
         files = [self.episodes.checkpoint]
         files += [
             value
-            for name in ("data_config", "tokenizer")
+            for name in FILES
             if isinstance(value := self.episodes.options.get(name), str) and Path(value).exists()
         ]
         with output.progress_bar("libero", len(self.items)) as update:
@@ -193,16 +196,22 @@ def prepare(args: argparse.Namespace, workers: Workers) -> Session:
     checkpoint = locate(args.checkpoint).path
     options = arguments.policy_options(args)
     options["num_threads"] = args.num_threads if workers.alone else workers.num_threads
-    options = {name: str(value) if isinstance(value, Path) else value for name, value in options.items()}
+    given = {name: Path(options[name]) for name in FILES if options[name] is not None}
+    found = {name: path for name, path in given.items() if path.exists()}
+    options |= {name: str(path) for name, path in given.items()}
+    options |= {name: path_text(path) for name, path in found.items()}  # other machines have it elsewhere
     noise = Noise(args.seed, args.same_noise)
-    episodes = Episodes(str(checkpoint), args.protocol, options, noise, args.video)
+    episodes = Episodes(path_text(checkpoint), args.protocol, options, noise, args.video)
     with output.progress_bar("loading", transient=True):
         policy = episodes.policy
         sha256 = weights_hash(checkpoint)
     settings = {
         "protocol": policy.record(list(args.suite)),
         "checkpoint": {"name": checkpoint.resolve().name, "sha256": sha256},
-        "options": {name: value for name, value in options.items() if name != "num_threads"},
+        "options": {
+            **{name: value for name, value in options.items() if name != "num_threads"},
+            "hashes": {name: weights_hash(path) for name, path in found.items()},
+        },
         "noise": vars(noise),
     }
     results = Results.begin(args.out, settings)

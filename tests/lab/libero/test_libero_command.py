@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import importlib.util
 import json
+import pickle
 from collections.abc import Callable
+from importlib import resources
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -12,10 +14,13 @@ from typing import Any
 import pytest
 
 from saccade import cli
+from saccade_lab.cli.libero import prepare
 from saccade_lab.libero import episodes, packages, suites
 from saccade_lab.libero.policy import LiberoPolicy
+from saccade_lab.parallel import Workers
+from saccade_lab.parallel.files import located, relocated
 from saccade_lab.sim import graphics
-from tests.helpers.libero_runs import StandIn, checkpoint
+from tests.helpers.libero_runs import DATA_CONFIG, StandIn, checkpoint
 
 Run = Callable[..., dict[str, Any]]
 
@@ -118,6 +123,30 @@ def test_ctrl_c_keeps_what_is_done(run: Run, made: list[StandIn], monkeypatch: p
     assert [one["trial"] for one in record["episodes"]] == [0]
     monkeypatch.setattr(StandIn, "restart", usual)
     assert [one["trial"] for one in run("--tasks", "0", "--trials", "2")["episodes"]] == [0, 1]
+
+
+def test_other_machines_find_the_files(
+    made: list[StandIn], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Bare names of files, which Ray brings to other machines."""
+    (tmp_path / "policy").symlink_to(checkpoint("n1.5"))
+    config = resources.files("saccade") / "robots" / "released_data_configs.json"
+    (tmp_path / "mine.json").write_text(json.dumps(json.loads(config.read_text())[DATA_CONFIG]))
+    monkeypatch.chdir(tmp_path)
+    words = ["libero", "policy", "--data-config", "mine.json", "--protocol", "isaac-n17"]
+    args = cli.build_parser("libero").parse_args(words)
+    session = prepare(args, Workers())
+    sources, work = located(
+        session.episodes, [session.episodes.checkpoint, str(session.episodes.options["data_config"])]
+    )
+    there = relocated(work, {path: Path("/elsewhere") / source.name for path, source in sources.items()})
+    assert Path(there.checkpoint).parent == Path("/elsewhere")
+    assert there.options["data_config"] == "/elsewhere/mine.json"
+    assert pickle.loads(pickle.dumps(there)) == there
+    # A file with other content under the same name is another option.
+    before = session.results.settings["options"]
+    (tmp_path / "mine.json").write_text((tmp_path / "mine.json").read_text() + "\n")
+    assert prepare(args, Workers()).results.settings["options"] != before
 
 
 def test_json_alone_is_printed(run: Run, capsys: pytest.CaptureFixture[str]) -> None:
