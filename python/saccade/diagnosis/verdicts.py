@@ -135,9 +135,9 @@ def possible_of(changes: Mapping[str, Effect]) -> dict[str, Effect]:
 
 def verdict_of(changes: Mapping[str, Effect], observation: Effect | None) -> Verdict:
     """The verdict on an input, and the effect that it rests on."""
-    possible = possible_of(changes).values()
-    main = [one for one in possible if one.kind == "main"]
-    others = sorted(possible, key=lambda one: one.share.value, reverse=True)
+    shown = (possible_of(changes) or changes).values()
+    main = [one for one in shown if one.kind == "main"]
+    others = sorted(shown, key=lambda one: one.share.value, reverse=True)
     nothing = Estimate(math.nan, math.nan, math.nan)
-    shown = next((one.share for one in (*main, *others)), nothing)
-    return Verdict(decided(changes, observation), shown.value, shown.low, shown.high, dict(changes))
+    effect = next((one.share for one in (*main, *others)), nothing)
+    return Verdict(decided(changes, observation), effect.value, effect.low, effect.high, dict(changes))
