@@ -189,13 +189,15 @@ class TrainingSettings:
 
 #: The settings of ``saccade train`` on demonstrations of LIBERO. Its scenes have seven objects that look
 #: alike, for which frames are larger than Meta-World's, and of no two of its tasks it is known that the words
-#: of one make no sense in the scene of the other.
+#: of one make no sense in the scene of the other. On two demonstrations, a head of N1.7 of width 64 reached a
+#: loss of 0.36 in 700 steps from the scale of ``released_std``, and 0.89 from 0.02.
 LIBERO_SETTINGS = TrainingSettings(
     version="n1.7",
     steps=20_000,
     absent_share=0.0,
     num_layers=8,
     execute_steps=8,
+    category_std=released_std(TrainingSettings.width),
     patch_size=32,
     view_size=192,
 )

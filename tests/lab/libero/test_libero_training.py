@@ -31,7 +31,7 @@ from saccade_lab.libero.sizes import libero_config
 from saccade_lab.reference import ActionHead, Backbone
 from saccade_lab.training.batches import Batches, prompts_of
 from saccade_lab.training.frozen import backbone_inputs
-from saccade_lab.training.settings import LIBERO_SETTINGS
+from saccade_lab.training.settings import LIBERO_SETTINGS, released_std
 from saccade_lab.training.train import Progress, new_run
 from tests.helpers.libero_cases import SAID, SIZE, TINY, demonstration, tiny, write_recording
 
@@ -170,6 +170,7 @@ def test_the_checkpoint_is_small_and_names_the_robot(trained: Path) -> None:
 
 
 def test_the_defaults_have_at_most_six_million_parameters() -> None:
+    assert LIBERO_SETTINGS.category_std == released_std(LIBERO_SETTINGS.width) > 0.06
     for version in VERSIONS:
         settings = dataclasses.replace(LIBERO_SETTINGS, version=version)
         with torch.device("meta"):
