@@ -306,7 +306,7 @@ def test_ray(session: nox.Session) -> None:
 
 @nox.session(name="test-libero")
 def test_libero(session: nox.Session) -> None:
-    """Test the tasks of LIBERO in the simulator, and against lerobot's and Isaac-GR00T's clients.
+    """Test the tasks of LIBERO in the simulator, against lerobot and what Isaac-GR00T's clients call.
 
     Downloads 550 MB. LIBERO is in no other environment.
     """

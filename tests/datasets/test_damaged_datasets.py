@@ -220,6 +220,11 @@ OPENING: list[tuple[str, Change, str]] = [
         lines("meta/episodes_stats.jsonl", lambda rows: [*rows, rows[1]]),
         "episode 1 is listed twice",
     ),
+    (
+        "v2.1",
+        lines("meta/episodes_stats.jsonl", lambda rows: [*rows, {**rows[0], "episode_index": 3}]),
+        "episode 3 has statistics and is not in episodes.jsonl",
+    ),
     ("v2.1", edited("meta/info.json", setting("features", [])), "features: expected an object, got list"),
     (
         "v2.1",

@@ -225,7 +225,11 @@ def _by_episode(meta: Path, episodes: Sequence[Episode]) -> Statistics | None:
         if index in rows:
             raise DatasetError(f"{path}: episode {index} is listed twice")
         rows[index] = row.get("stats")
-    absent = [str(episode.index) for episode in episodes if episode.index not in rows]
+    listed = {episode.index for episode in episodes}
+    unknown = sorted(set(rows) - listed)
+    if unknown:
+        raise DatasetError(f"{path}: episode {unknown[0]} has statistics and is not in episodes.jsonl")
+    absent = [str(index) for index in sorted(listed - set(rows))]
     if absent:
         raise DatasetError(
             f"{path}: expected the statistics of every episode, got none of {', '.join(absent[:5])}"

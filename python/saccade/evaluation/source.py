@@ -16,6 +16,7 @@ from saccade._internal.hub import commit_of, locate, parse
 from saccade.datasets import Dataset
 from saccade.datasets import open as open_recordings
 from saccade.datasets.source import folder_of
+from saccade.errors import InputError
 from saccade.policy.policy import Policy
 
 #: Files of a checkpoint that decide what it computes.
@@ -47,7 +48,11 @@ class Source:
         values = {name: str(value) if isinstance(value, Path) else value for name, value in options.items()}
         published = parse(recordings)
         if published is not None:
-            recordings = f"{published[0]}@{commit_of(folder_of(recordings))}"
+            folder = folder_of(recordings)
+            commit = commit_of(folder)
+            if commit is None:
+                raise InputError(f"recordings: {recordings}: its commit is not known, got the folder {folder}")
+            recordings = f"{published[0]}@{commit}"
         return cls(str(locate(checkpoint).path), recordings, values)
 
     @property

@@ -185,3 +185,19 @@ pub(crate) fn usable(threads: usize) -> usize {
         threads
     }
 }
+
+#[cfg(all(test, not(loom)))]
+mod tests {
+    use super::*;
+
+    /// Told without a clock: a worker that is slow to start must not look like one that is not asked.
+    #[test]
+    fn a_loop_within_a_task_or_a_guard_has_one_thread() {
+        parallel_for(2, 8, &|_| assert_eq!(usable(8), 1));
+        let (first, second) = (stay_on_this_thread(), stay_on_this_thread());
+        drop(first);
+        assert_eq!(usable(8), 1);
+        drop(second);
+        assert_eq!(usable(8), 8);
+    }
+}

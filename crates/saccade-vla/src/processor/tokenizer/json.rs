@@ -58,16 +58,20 @@ pub(super) fn parse(text: &str) -> Result<Parts> {
     let file: File = serde_json::from_str(text).map_err(|source| Error::json("tokenizer", source))?;
     let mut problems = Problems::default();
     check_kind(&file, &mut problems);
-    problems.into_result()?;
     let added = file.added_tokens.into_iter();
-    let merges = file.model.merges.into_iter().map(|merge| match merge {
+    let merges = file.model.merges.into_iter().enumerate();
+    let merges = merges.map(|(rank, merge)| match merge {
         Merge::Pair(left, right) => (left, right),
-        // A line that is no pair is refused with those whose tokens are unknown.
-        Merge::Line(line) => pair(&line).unwrap_or((line, String::new())),
+        Merge::Line(line) => pair(&line).unwrap_or_else(|| {
+            problems.add(|| format!("merges: {rank}: expected two tokens, got {line:?}"));
+            Default::default()
+        }),
     });
+    let merges = merges.collect();
+    problems.into_result()?;
     Ok(Parts {
         vocab: file.model.vocab.0,
-        merges: merges.collect(),
+        merges,
         added: added.map(|added| (added.id, added.token)).collect(),
     })
 }
