@@ -51,7 +51,9 @@ class Source:
             folder = folder_of(recordings)
             commit = commit_of(folder)
             if commit is None:
-                raise InputError(f"recordings: {recordings}: its commit is not known, got the folder {folder}")
+                raise InputError(
+                    f"recordings: {recordings}: its commit is not known, got the folder {folder}"
+                )
             recordings = f"{published[0]}@{commit}"
         return cls(str(locate(checkpoint).path), recordings, values)
 
