@@ -11,6 +11,7 @@ import pytest
 
 import saccade
 from saccade.errors import InputError
+from saccade.robots.libero import EXECUTED_STEPS
 from saccade_lab.libero.policy import LiberoPolicy
 from tests.helpers.libero_runs import checkpoint, seen, whole
 from tests.helpers.paths import ROOT
@@ -40,7 +41,7 @@ def test_a_raw_checkpoint_acts_as_in_the_command() -> None:
     observation["observation.images.image2"] = observation.pop("observation.images.wrist_image")
     actions = policy.act(observation, seed=4)
     assert np.array_equal(actions, command.act(shown, seed=4).actions)
-    assert command.execute_steps == libero.NUM_STEPS
+    assert command.execute_steps == EXECUTED_STEPS
     with pytest.raises(InputError, match="wrist_image"):
         given.act(observation, seed=4)
 

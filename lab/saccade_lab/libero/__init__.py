@@ -11,8 +11,10 @@ Importing this package registers a gymnasium environment for each task of ``sacc
 
 Modules: ``packages`` (LIBERO's packages and their versions), ``suites`` (tasks, instructions, initial
 states), ``state`` (the state vector), ``drawing`` (cameras), ``simulation`` (starts and steps),
-``environment``; ``grasps``, ``expert``, ``scene``, ``placements``, ``demos`` and ``recording``
-(demonstrations); ``checkpoint``, ``sizes`` and ``training`` (small policies).
+``environment``; ``protocols``, ``policy``, ``execution``, ``gripper``, ``episode``, ``starts``, ``rollout``,
+``episodes``, ``video``, ``results`` and ``page`` (measuring a checkpoint); ``grasps``, ``expert``,
+``scene``, ``placements``, ``demos`` and ``recording`` (demonstrations); ``checkpoint``, ``sizes`` and
+``training`` (small policies).
 Needs the extra ``libero``. Opens no window.
 """
 

@@ -10,12 +10,16 @@ from saccade import Policy
 from saccade._internal.arrays import Float32Array
 from saccade.errors import InputError
 from saccade.robots.groups import Group
+from saccade.robots.libero import TAG, is_isaac_libero
 from saccade_lab.libero.protocols import AS_GIVEN, OPEN_IS_ONE, Protocol
 
 #: How far bounds of statistics may be from the two known ranges.
 TOLERANCE = 1e-3
 #: The ranges of statistics, and what they say.
 RANGES = {(0.0, 1.0): OPEN_IS_ONE, (-1.0, 1.0): AS_GIVEN}
+#: Embodiments of checkpoints for LIBERO in Isaac-GR00T's layouts: only theirs are these ranges known to mean
+#: that. Published N1.5 checkpoints have N1.5's tag for any robot.
+EMBODIMENTS = {"n1.5": ("new_embodiment", TAG), "n1.6": ("libero_panda",), "n1.7": (TAG,)}
 
 
 @dataclass(frozen=True)
@@ -54,28 +58,45 @@ def gripper_rule(policy: Policy, protocol: Protocol, *, by_statistics: bool) -> 
             the protocol's program does, whatever they are.
 
     Raises:
-        InputError: The statistics are to decide, and are neither from 0 to 1 nor from -1 to 1.
+        InputError: The statistics are to decide, and are neither from 0 to 1 nor from -1 to 1; or the
+            embodiment is none that is known for LIBERO; or they contradict what lerobot does with a
+            checkpoint that it saved.
     """
-    normalizer = policy.normalizer
-    if normalizer.gripper is not None:
-        return GripperRule(AS_GIVEN, "lerobot's steps in the checkpoint give what the environment takes")
+    normalizer, version = policy.normalizer, policy.head.config.version
     last = next((group for group in normalizer.action_groups if group.key == "gripper"), None)
     last = last or normalizer.action_groups[-1]  # lerobot's one group of all numbers
     said = _said(last)
     bounds = None if last.mode == "binary" else _bounds(last)
     shown = "binary statistics" if last.mode == "binary" else f"statistics {_shown(bounds)}"
+    by_name = f"pass --protocol {protocol.name} to do what its program does"
+    if normalizer.pipeline is not None:
+        done = AS_GIVEN if normalizer.gripper is None else OPEN_IS_ONE
+        reason = f"lerobot's steps in the checkpoint did it, {done}, as its config.json says"
+        if said not in (None, done):
+            if by_statistics:
+                raise InputError(
+                    f"--protocol auto: the gripper is {done} by the checkpoint's config.json, but its "
+                    f"{shown} say {said}: {by_name}"
+                )
+            reason += f"; the checkpoint's {shown} say {said}"
+        return GripperRule(AS_GIVEN, reason)  # nothing is left to do
     if by_statistics:
+        known = EMBODIMENTS.get(version, ())
+        if normalizer.embodiment not in known:
+            raise InputError(
+                f"--protocol auto: what the gripper's number means is known for the embodiments "
+                f"{', '.join(known)} of {version}, got {normalizer.embodiment}: {by_name}"
+            )
         if said is None:
             raise InputError(
                 f"--protocol auto: action.{last.key}: expected statistics of the gripper from 0 to 1 (1 is "
-                f"open) or from -1 to 1 (1 closes), got {shown} ({last.mode}): pass --protocol "
-                f"{protocol.name} to do what its program does"
+                f"open) or from -1 to 1 (1 closes), got {shown} ({last.mode}): {by_name}"
             )
         return GripperRule(said, f"the checkpoint's {shown}")
     if not protocol.lerobot_form:
         rule, reason = protocol.gripper, "the program does it with every checkpoint"
-    elif normalizer.pipeline is None and normalizer.embodiment == "libero_sim":
-        rule, reason = OPEN_IS_ONE, "lerobot does it for the embodiment libero_sim"
+    elif is_isaac_libero(normalizer, version):
+        rule, reason = OPEN_IS_ONE, f"lerobot does it for the embodiment {TAG}"
     else:
         rule, reason = protocol.gripper, "lerobot passes on what the checkpoint gives"
     doubt = "" if said in (None, rule) else f"; the checkpoint's {shown} say {said}"

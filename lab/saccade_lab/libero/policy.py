@@ -16,8 +16,8 @@ import numpy as np
 
 import saccade
 from saccade._internal.arrays import Float32Array, UInt8Array
-from saccade._internal.small_files import read_json
-from saccade.errors import CheckpointError, InputError
+from saccade.errors import InputError
+from saccade_lab.libero.execution import execute_steps
 from saccade_lab.libero.gripper import gripper_rule
 from saccade_lab.libero.protocols import AUTO, Protocol, choose_protocol
 
@@ -33,8 +33,8 @@ CAMERAS = {"image": ("image",), "wrist_image": ("wrist_image", "image2")}
 #: The language key of Isaac-GR00T's clients.
 LANGUAGE = "annotation.human.action.task_description"
 
-#: lerobot executes as many actions of these checkpoints as they are in Isaac-GR00T's layout.
-LIBERO_TAG, LIBERO_STEPS = "libero_sim", 8
+#: Whose steps prepare frames and words, by ``Processor.preprocessing``.
+PROGRAMS = {"isaac": "Isaac-GR00T's", "lerobot": "lerobot's"}
 
 
 @dataclass(frozen=True)
@@ -82,20 +82,20 @@ class LiberoPolicy:
         self.protocol, self.reason = choose_protocol(
             asked, whole.head.config.version, from_lerobot=from_lerobot
         )
-        ordered = self.protocol.lerobot_form
-        self._action_places = action_places(whole, ordered=ordered)
-        self._state_is_named = state_is_named(whole, ordered=ordered)
-        self._names = camera_names(whole, self.protocol)
-        self.gripper = gripper_rule(whole, self.protocol, by_statistics=asked == AUTO)
-        self.execute_steps, self._execute_reason = execute_steps(whole, checkpoint, self.protocol)
-        untold = whole.head.config.version in ("n1", "n1.5") and whole.normalizer.data_config is None
-        if self.protocol.name == "isaac-n15" and not from_lerobot and untold:
+        if whole.head.config.version == "n1.5" and not from_lerobot and whole.normalizer.data_config is None:
             raise InputError(
                 "--data-config: the checkpoint does not say how it was trained. Isaac-GR00T's examples took "
                 "examples.Libero.custom_data_config:LiberoDataConfig for libero_spatial, libero_object and "
                 "libero_90, and examples.Libero.custom_data_config:LiberoDataConfigMeanStd for libero_goal "
                 "and libero_10"
             )
+        self._is_raw = not from_lerobot
+        ordered = self.protocol.lerobot_form
+        self._action_places = action_places(whole, ordered=ordered)
+        self._state_is_named = state_is_named(whole, ordered=ordered)
+        self._names = camera_names(whole, self.protocol)
+        self.gripper = gripper_rule(whole, self.protocol, by_statistics=asked == AUTO)
+        self.execute_steps, self._execute_reason = execute_steps(whole, checkpoint, self.protocol)
 
     @property
     def num_steps(self) -> int:
@@ -104,8 +104,22 @@ class LiberoPolicy:
 
     def record(self, suites: list[str]) -> dict[str, Any]:
         """The protocol as results have it: ``Protocol.record``, and what depends on the checkpoint."""
+        assert self.whole.processor is not None
+        record = self.protocol.record(suites)
+        preprocessing = self.whole.processor.preprocessing
+        program = record["program"].format(version=self.whole.head.config.version.upper())
+        remark = record["remark"]
+        if self.protocol.lerobot_form and self._is_raw:
+            program += ", with saccade's plugin (--policy.type=saccade)"
+            remark += (
+                f" Frames and words are prepared by {PROGRAMS[preprocessing]} steps, as the plugin does with "
+                "checkpoints of this layout; lerobot's own groot policy has other steps."
+            )
         return {
-            **self.protocol.record(suites),
+            **record,
+            "program": program,
+            "remark": remark,
+            "preprocessing": preprocessing,
             "chosen": self.reason,
             "execute_steps": self.execute_steps,
             "execute_steps_reason": self._execute_reason,
@@ -230,12 +244,17 @@ def camera_names(policy: saccade.Policy, protocol: Protocol) -> dict[str, str]:
     Both are always shown, as the released clients do.
 
     Raises:
-        InputError: The checkpoint wants a camera that is none of them.
+        InputError: The checkpoint does not name its cameras, or wants one that is none of them.
     """
     needs = policy.requirements
+    if needs.cameras is None:
+        raise InputError(
+            "checkpoint: cameras: expected names, but it does not say which it was trained with, and in "
+            "which order"
+        )
     renamed = dict(needs.rename_map) if protocol.lerobot_form else {}
     prefix = "observation.images."
-    wanted = {camera.name for camera in needs.cameras or ()}
+    wanted = {camera.name for camera in needs.cameras}
     known = {name for names in CAMERAS.values() for name in names}
     given = {renamed.get(prefix + name, prefix + name).removeprefix(prefix) for name in known}
     unknown = sorted(wanted - given)
@@ -244,7 +263,7 @@ def camera_names(policy: saccade.Policy, protocol: Protocol) -> dict[str, str]:
             f"checkpoint: expected cameras called {', '.join(sorted(known))}, got {', '.join(unknown)}: "
             "which of LIBERO's two cameras is that?"
         )
-    accepted = wanted | {camera.alias for camera in needs.cameras or () if camera.alias}
+    accepted = wanted | {camera.alias for camera in needs.cameras if camera.alias}
     usual = {"image": "image", "wrist_image": "image2" if protocol.lerobot_form else "wrist_image"}
     found = {}
     for camera, names in CAMERAS.items():
@@ -255,35 +274,3 @@ def camera_names(policy: saccade.Policy, protocol: Protocol) -> dict[str, str]:
         ]
         found[camera] = usual[camera] if usual[camera] in fitting or not fitting else fitting[0]
     return found
-
-
-def execute_steps(policy: saccade.Policy, checkpoint: Path, protocol: Protocol) -> tuple[int, str]:
-    """How many actions of a chunk are executed, and why.
-
-    Raises:
-        InputError: A chunk has fewer than the protocol executes.
-        CheckpointError: ``n_action_steps`` of lerobot's config is no number.
-    """
-    normalizer = policy.normalizer
-    denoised = policy.head.config.action_horizon
-    horizon = min(normalizer.action_horizon or denoised, denoised)
-    trained = min(horizon, normalizer.trained_horizon or horizon)
-    if protocol.execute_steps is not None:
-        if trained < protocol.execute_steps:
-            raise InputError(
-                f"--protocol {protocol.name}: executes {protocol.execute_steps} actions of a chunk, the "
-                f"checkpoint has {trained}"
-            )
-        return protocol.execute_steps, "as the program"
-    if normalizer.pipeline is None:
-        if normalizer.embodiment == LIBERO_TAG:
-            return min(trained, LIBERO_STEPS), f"lerobot executes {LIBERO_STEPS} for {LIBERO_TAG}"
-        return trained, "all of a chunk, as lerobot does where the checkpoint does not say"
-    said = read_json(checkpoint / "config.json").get("n_action_steps")
-    if said is None:
-        return trained, "all of a chunk: the checkpoint's config has no n_action_steps"
-    if type(said) is not int or said < 1:
-        raise CheckpointError(
-            f"{checkpoint / 'config.json'}: n_action_steps: expected a number from 1 on, got {said!r}"
-        )
-    return min(said, trained), "n_action_steps of the checkpoint's config"

@@ -30,7 +30,9 @@ class Protocol:
 
     Attributes:
         name: One of ``PROTOCOLS``.
-        program: The released program, and its version.
+        program: The released program, and its version; ``{version}`` stands for the checkpoint's.
+        loads: Versions of checkpoints that the program loads. Those of Isaac-GR00T load no checkpoint that
+            lerobot saved.
         official_states: Whether trial ``i`` begins in the official initial state ``i`` (modulo their number).
             Otherwise it begins in a random layout.
         settle_steps: Control steps with the arm at rest before the first observation.
@@ -49,6 +51,7 @@ class Protocol:
 
     name: str
     program: str
+    loads: tuple[str, ...]
     official_states: bool
     settle_steps: int
     limits: Mapping[str, int]
@@ -98,22 +101,25 @@ PROTOCOLS: Mapping[str, Protocol] = {
     for protocol in (
         Protocol(
             name="lerobot",
-            program="lerobot-eval --env.type=libero, lerobot 0.6.2 (7427f31)",
+            program="lerobot-eval --env.type=libero --eval.batch_size=1, lerobot 0.6.2 (7427f31)",
+            loads=("n1.7",),
             official_states=True,
             settle_steps=10,
-            limits=dict(zip(OFFICIAL, (280, 280, 300, 520, 400), strict=True)),
+            limits={suite: steps for suite, (_, steps) in OFFICIAL.items()},
             execute_steps=None,
             image_size=360,
             lerobot_form=True,
             gripper=AS_GIVEN,
             seeding=EVERY_EPISODE,
             first_seed=1000,
-            remark="lerobot before 2026-07-31 (7a3298ea2) left out initial states when it reset by itself; "
-            "its numbers are of other states.",
+            remark="By default lerobot-eval runs several environments at once, as many as the machine has "
+            "cores for; trials then have other seeds. lerobot before 2026-07-31 (7a3298ea2) left out initial "
+            "states when it reset by itself; its numbers are of other states.",
         ),
         Protocol(
             name="isaac-n17",
-            program="Isaac-GR00T N1.6 and N1.7, gr00t/eval/rollout_policy.py",
+            program="rollout_policy.py --max-episode-steps 720 --n-action-steps 8 of Isaac-GR00T {version}",
+            loads=("n1.6", "n1.7"),
             official_states=False,
             settle_steps=0,
             limits=dict.fromkeys(OFFICIAL, 720),
@@ -123,12 +129,17 @@ PROTOCOLS: Mapping[str, Protocol] = {
             gripper=OPEN_IS_ONE,
             seeding=EVERY_EPISODE,
             first_seed=0,
-            remark="The released program gives no seed, so that each of its runs has other layouts; here "
-            "they can be repeated. Objects are still falling in the first frames.",
+            remark="The options are those of its README's command; stored revisions of the program itself "
+            "have 504 or 720 steps as their default. The program stops at a number of finished episodes and "
+            "drops those that are still running. Of several environments short episodes finish first, so "
+            "its rates are biased upwards; here every trial counts. It gives no seed, so that each of its "
+            "runs has other layouts; here they can be repeated. Objects are still falling in the first "
+            "frames.",
         ),
         Protocol(
             name="isaac-n15",
-            program="Isaac-GR00T N1.5, examples/Libero/eval/run_libero_eval.py",
+            program="examples/Libero/eval/run_libero_eval.py of Isaac-GR00T N1.5 (15166e3)",
+            loads=("n1.5",),
             official_states=True,
             settle_steps=10,
             # libero_10 has 1000 there, but robosuite refuses to go beyond 1000 steps with those of settling,
@@ -141,13 +152,18 @@ PROTOCOLS: Mapping[str, Protocol] = {
             seeding=EVERY_TASK,
             first_seed=0,
             num_steps=8,
-            remark="8 denoising steps, with which its README serves the checkpoints.",
+            remark="8 denoising steps, with which its README serves the checkpoints. The program sends the "
+            "state as float64; here it is rounded to float32 first.",
         ),
     )
 }
 
 #: The protocol that ``auto`` takes for checkpoints of Isaac-GR00T's layouts, by version.
 OF_VERSION = {"n1.5": "isaac-n15", "n1.6": "isaac-n17", "n1.7": "isaac-n17"}
+#: Why nothing evaluates an N1.5 that lerobot saved.
+OLD_LEROBOT = (
+    "lerobot 0.6.2 does not load N1.5; the last release that does, 0.5.1, begins its episodes in other states"
+)
 
 
 def choose_protocol(asked: str, version: str, *, from_lerobot: bool) -> tuple[Protocol, str]:
@@ -159,26 +175,36 @@ def choose_protocol(asked: str, version: str, *, from_lerobot: bool) -> tuple[Pr
         from_lerobot: Whether lerobot saved the checkpoint.
 
     Raises:
-        InputError: The name is unknown, or no protocol is known for the version.
+        InputError: The name is unknown, its program does not load such a checkpoint, or none does.
 
     Example:
         >>> protocol, reason = choose_protocol("auto", "n1.7", from_lerobot=False)
         >>> protocol.name, reason
         ('isaac-n17', 'the checkpoint has the layout of Isaac-GR00T n1.7')
     """
-    if asked in PROTOCOLS:
-        return PROTOCOLS[asked], "as given"
-    if asked != AUTO:
+    if asked not in (AUTO, *PROTOCOLS):
         raise InputError(
             f"--protocol: unknown name {asked!r}, expected one of {', '.join((AUTO, *PROTOCOLS))}"
         )
-    if from_lerobot:
-        return PROTOCOLS["lerobot"], "lerobot saved the checkpoint"
-    if version not in OF_VERSION:
+    fitting = [
+        protocol.name
+        for protocol in PROTOCOLS.values()
+        if version in protocol.loads and (protocol.lerobot_form or not from_lerobot)
+    ]
+    kind = f"{version} that lerobot saved" if from_lerobot else f"{version} in Isaac-GR00T's layout"
+    if not fitting:
+        why = f": {OLD_LEROBOT}" if from_lerobot and version == "n1.5" else ""
+        raise InputError(f"--protocol {asked}: no protocol is known for checkpoints of {kind}{why}")
+    if asked == AUTO:
+        if from_lerobot:
+            return PROTOCOLS[fitting[0]], "lerobot saved the checkpoint"
+        return PROTOCOLS[OF_VERSION[version]], f"the checkpoint has the layout of Isaac-GR00T {version}"
+    if asked not in fitting:
         raise InputError(
-            f"--protocol: none is known for checkpoints of {version}: expected one of {', '.join(PROTOCOLS)}"
+            f"--protocol {asked}: its program does not load checkpoints of {kind}: expected one of "
+            f"{', '.join((AUTO, *fitting))}"
         )
-    return PROTOCOLS[OF_VERSION[version]], f"the checkpoint has the layout of Isaac-GR00T {version}"
+    return PROTOCOLS[asked], "as given"
 
 
 def described(protocol: Mapping[str, Any]) -> dict[str, str]:

@@ -39,8 +39,8 @@ class Suite:
         base: The suite of LIBERO that it perturbs, or itself.
         num_tasks: Number of tasks.
         told_by: ``"name"`` or ``"file"``: where the instruction of a task is taken from.
-        max_steps: Control steps after which an episode has failed, settling not counted. Those of lerobot
-            0.6, to which released protocols compare; a perturbed suite has those of its base.
+        max_steps: Control steps after which an episode has failed in lerobot 0.6.2, settling not counted. A
+            perturbed suite has those of its base.
     """
 
     name: str
@@ -73,7 +73,7 @@ class Task:
     bddl_file: Path
 
 
-#: Suites of LIBERO: number of tasks and control steps.
+#: Suites of LIBERO: number of tasks, and lerobot's limit of control steps.
 OFFICIAL = {
     "libero_spatial": (10, 280),
     "libero_object": (10, 280),

@@ -7,18 +7,15 @@ camera by the name that lerobot's data sets and its environment have for it.
 from dataclasses import replace
 
 import saccade
+from saccade.robots.libero import TAG, is_isaac_libero
 
-#: The robot's tag in N1.7, and what is executed of a chunk.
-TAG, NUM_STEPS = "libero_sim", 8
 #: lerobot's second name of a camera.
 ALIASES = {"wrist_image": "image2"}
 
 
 def is_libero(policy: saccade.Policy) -> bool:
     """Whether a policy is such a checkpoint; one that lerobot saved says itself what is done."""
-    normalizer = policy.normalizer
-    is_raw = normalizer.pipeline is None and policy.head.config.version == "n1.7"
-    return is_raw and normalizer.embodiment == TAG
+    return is_isaac_libero(policy.normalizer, policy.head.config.version)
 
 
 def as_in_lerobot(policy: saccade.Policy) -> saccade.Policy:

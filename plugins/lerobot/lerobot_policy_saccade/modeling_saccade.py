@@ -26,10 +26,11 @@ from lerobot_policy_saccade.files import (
     folder_of,
 )
 from lerobot_policy_saccade.lerobot_config import saved_options
-from lerobot_policy_saccade.libero import NUM_STEPS, as_in_lerobot, is_libero
+from lerobot_policy_saccade.libero import as_in_lerobot, is_libero
 from lerobot_policy_saccade.processor_saccade import make_saccade_pre_post_processors
 from lerobot_policy_saccade.real_time_chunking import continued
 from saccade.robots.data_configs import RELEASED
+from saccade.robots.libero import EXECUTED_STEPS
 
 OBSERVATION, TASK = "observation.", "task"
 
@@ -102,7 +103,7 @@ class SaccadePolicy(PreTrainedPolicy):
         denoised = self.policy.head.config.action_horizon
         horizon = min(normalizer.action_horizon or denoised, denoised)
         self._trained = min(horizon, normalizer.trained_horizon or horizon)
-        usual = NUM_STEPS if is_libero(policy) else None
+        usual = EXECUTED_STEPS if is_libero(policy) else None
         self._steps = _steps(config.n_action_steps, saved.n_action_steps or usual, horizon, self._trained)
         features = saved.image_features or _image_features(self.policy)
         config.checkpoint_image_features = features  # type: ignore[misc]  # a field would be saved

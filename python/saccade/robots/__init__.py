@@ -4,7 +4,8 @@
   ``rotations`` that of rotations and poses.
 - ``reading``: finds the statistics of a checkpoint and chooses their layout: ``isaac_metadata`` (Isaac-GR00T
   N1 and N1.5, with ``data_configs``), ``isaac_processor`` (Isaac-GR00T N1.6 and N1.7), or ``lerobot`` (with
-  ``lerobot_pipeline``). ``building`` has what the layouts share.
+  ``lerobot_pipeline``). ``building`` has what the layouts share,
+  ``libero`` what lerobot does with one embodiment.
 - ``embodiments``: the tags and ids of each release.
 """
 

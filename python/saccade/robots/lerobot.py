@@ -26,6 +26,7 @@ from saccade.robots.isaac_processor import (
     refuse_unknown_fields,
 )
 from saccade.robots.lerobot_pipeline import DECODE, Pipeline, action_steps, read_pipeline
+from saccade.robots.libero import TAG as LIBERO_TAG
 from saccade.robots.robot import Robot, finished
 from saccade.robots.rotations import POSES
 
@@ -241,7 +242,7 @@ def _libero(builder: Builder, pipeline: Pipeline, action: tuple[Group, ...], nat
     config = pipeline.config
     wanted = config.get("action_decode_transform", "auto")
     if wanted == "auto":
-        wanted = "libero" if config.get("embodiment_tag", "new_embodiment") == "libero_sim" else None
+        wanted = "libero" if config.get("embodiment_tag", "new_embodiment") == LIBERO_TAG else None
     if wanted in (None, "", "none"):
         return None
     if wanted != "libero":

@@ -133,7 +133,7 @@ def test_other_machines_find_the_files(
     config = resources.files("saccade") / "robots" / "released_data_configs.json"
     (tmp_path / "mine.json").write_text(json.dumps(json.loads(config.read_text())[DATA_CONFIG]))
     monkeypatch.chdir(tmp_path)
-    words = ["libero", "policy", "--data-config", "mine.json", "--protocol", "isaac-n17"]
+    words = ["libero", "policy", "--data-config", "mine.json", "--protocol", "isaac-n15"]
     args = cli.build_parser("libero").parse_args(words)
     session = prepare(args, Workers())
     sources, work = located(

@@ -105,7 +105,7 @@ def test_the_seed_decides_the_actions() -> None:
         ("n1.7", "auto", 8, "-sign(2 g - 1)", "statistics from 0 to 1"),
         ("n1.7", "isaac-n17", 8, "-sign(2 g - 1)", "the program does it with every checkpoint"),
         ("n1.7", "lerobot", 8, "-sign(2 g - 1)", "lerobot does it for the embodiment libero_sim"),
-        ("n1.6", "lerobot", 16, "as given", "statistics from 0 to 1 say -sign(2 g - 1)"),
+        ("n1.6", "isaac-n17", 8, "-sign(2 g - 1)", "the program does it with every checkpoint"),
         ("n1.5", "auto", 1, "-sign(2 g - 1)", "statistics from 0 to 1"),
     ],
 )
@@ -117,6 +117,12 @@ def test_the_record_says_what_was_chosen_and_why(
     assert record["gripper"]["rule"] == rule
     assert reason in record["gripper"]["reason"]
     assert record["cameras"] == {"image": "image", "wrist_image": "wrist_image"}
+    assert record["preprocessing"] == "isaac"
+    with_plugin = asked == "lerobot"
+    assert ("saccade's plugin" in record["program"]) is with_plugin
+    assert ("prepared by Isaac-GR00T's steps" in record["remark"]) is with_plugin
+    if not with_plugin:
+        assert f"Isaac-GR00T {version.upper()}" in record["program"]
 
 
 def with_gripper(low: float, high: float, mode: str = "min_max") -> saccade.Policy:
@@ -210,11 +216,17 @@ def test_another_robot_is_refused_by_name(tmp_path: Path) -> None:
         random_checkpoint.write(tmp_path / "none", "n1.7", robot="table")
 
 
-def test_n15_wants_its_data_config() -> None:
+@pytest.mark.parametrize("asked", ["auto", "isaac-n15"])
+def test_n15_wants_its_data_config(asked: str) -> None:
     with pytest.warns(UserWarning, match="data_config"):
         policy = saccade.Policy.from_pretrained(checkpoint("n1.5"))
     with pytest.raises(InputError, match=r"--data-config: .*LiberoDataConfigMeanStd for libero_goal"):
-        LiberoPolicy(policy, checkpoint("n1.5"), "auto")
+        LiberoPolicy(policy, checkpoint("n1.5"), asked)
+
+
+def test_a_checkpoint_must_say_its_cameras() -> None:
+    with pytest.raises(InputError, match="cameras: expected names, but it does not say"):
+        LiberoPolicy(other_robot(cameras=None), checkpoint("n1.7"), "isaac-n17")
 
 
 def test_an_observation_that_is_not_whole_is_refused() -> None:
