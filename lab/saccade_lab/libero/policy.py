@@ -92,7 +92,7 @@ class LiberoPolicy:
         self._is_raw = not from_lerobot
         ordered = self.protocol.lerobot_form
         self._action_places = action_places(whole, ordered=ordered)
-        self._state_is_named = state_is_named(whole, ordered=ordered)
+        check_state(whole, ordered=ordered)
         self._names = camera_names(whole, self.protocol)
         self.gripper = gripper_rule(whole, self.protocol, by_statistics=asked == AUTO)
         self.execute_steps, self._execute_reason = execute_steps(whole, checkpoint, self.protocol)
@@ -153,11 +153,9 @@ class LiberoPolicy:
             }
         parts = np.split(state, np.cumsum(list(STATE_SIZES.values()))[:-1])
         named = dict(zip(STATE_SIZES, parts, strict=True))
-        key = self.whole.requirements.state[0][0]
-        states = named if self._state_is_named else {key: state}
         return {
             **{f"video.{name}": frame[None] for name, frame in frames.items()},
-            **{f"state.{name}": part[None] for name, part in states.items()},
+            **{f"state.{name}": part[None] for name, part in named.items()},
             self.whole.requirements.language_key or LANGUAGE: [seen["instruction"]],
         }
 
@@ -215,8 +213,8 @@ def action_places(policy: saccade.Policy, *, ordered: bool) -> list[int]:
     )
 
 
-def state_is_named(policy: saccade.Policy, *, ordered: bool) -> bool:
-    """Whether the state has a key for each of ``STATE_SIZES``; otherwise it is lerobot's one of 8 numbers.
+def check_state(policy: saccade.Policy, *, ordered: bool) -> None:
+    """Checks that the state has a key for each of ``STATE_SIZES``, or is lerobot's one of 8 numbers.
 
     ``ordered`` is as for ``action_places``.
 
@@ -224,14 +222,12 @@ def state_is_named(policy: saccade.Policy, *, ordered: bool) -> bool:
         InputError: It is neither.
     """
     sizes = dict(policy.requirements.state)
-    if sizes == STATE_SIZES and (not ordered or tuple(sizes) == tuple(STATE_SIZES)):
-        return True
-    if list(sizes.values()) == [STATE_DIM] and policy.normalizer.pipeline is not None:
-        return False
-    raise InputError(
-        f"checkpoint: expected the state of LIBERO in this order, {_listed(STATE_SIZES)}, or lerobot's of "
-        f"{STATE_DIM}, got {_listed(sizes)}"
-    )
+    is_named = sizes == STATE_SIZES and (not ordered or tuple(sizes) == tuple(STATE_SIZES))
+    if not is_named and (list(sizes.values()) != [STATE_DIM] or policy.normalizer.pipeline is None):
+        raise InputError(
+            f"checkpoint: expected the state of LIBERO in this order, {_listed(STATE_SIZES)}, or lerobot's "
+            f"of {STATE_DIM}, got {_listed(sizes)}"
+        )
 
 
 def _listed(sizes: Mapping[str, int]) -> str:
