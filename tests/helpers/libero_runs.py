@@ -67,13 +67,15 @@ class StandIn:
         self.lasts = lasts
         self.steps = 0
         self.is_closed = False
-        self.starts: list[tuple[int | None, int | None, int, int]] = []
+        self.starts: list[tuple[int | None, int | None, int, int | None]] = []
         self.actions: list[npt.NDArray[np.float32]] = []
         self.looks: list[int] = []
         self.last_observation: dict[str, Any] = {}
         self.instruction = INSTRUCTION
 
-    def restart(self, state: int | None, seed: int | None, *, resets: int = 1, loads: int = 1) -> None:
+    def restart(
+        self, state: int | None, seed: int | None, *, resets: int = 1, loads: int | None = None
+    ) -> None:
         """See ``LiberoEnvironment``."""
         self.starts.append((state, seed, resets, loads))
         self.steps = 0

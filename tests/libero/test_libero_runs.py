@@ -51,6 +51,41 @@ def test_processes_give_the_same_episodes(tmp_path: Path) -> None:
         assert (tmp_path / "alone" / name).read_bytes() == (tmp_path / "several" / name).read_bytes()
 
 
+def test_a_layout_without_room_counts_however_a_run_is_split() -> None:
+    """The third load of the model after the seed has no room for all objects, and LIBERO draws again."""
+    from robosuite.utils.errors import RandomizationError
+
+    environment_cache.close()
+    protocol = PROTOCOLS["isaac-n15"]
+    environment = LiberoEnvironment("libero_spatial", 4, image_size=64, settle_steps=0)
+    inner = environment.simulation.inner
+    drawn, usual = len(inner.object_property_initializers), inner._reset_internal
+    assert drawn > 0  # a drawer is open at the start, so that earlier loads change the layout
+    failed = []
+
+    def reset_internal() -> None:
+        usual()
+        if len(inner.object_property_initializers) == 3 * drawn:
+            failed.append(drawn)
+            raise RandomizationError("no room")
+
+    inner._reset_internal = reset_internal
+    try:
+        starts = Starts(environment, protocol)
+        in_order = []
+        for trial in (0, 1, 2):
+            starts.begin(trial)
+            in_order.append(np.array(environment.simulation.model.body_pos))
+        assert len(failed) == 1
+        Starts(environment, protocol).begin(2)
+        assert len(failed) == 2
+        alone = np.array(environment.simulation.model.body_pos)
+    finally:
+        environment.close()
+    np.testing.assert_array_equal(alone, in_order[2])
+    assert np.abs(in_order[2] - in_order[1]).max() > 1e-4
+
+
 def first_look(starts: Starts, trial: int) -> Any:
     """Pixels and state at the start of a trial."""
     starts.begin(trial)

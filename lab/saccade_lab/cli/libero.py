@@ -5,15 +5,15 @@ from __future__ import annotations
 import argparse
 import datetime
 import time
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from saccade._internal import flags as arguments
-from saccade._internal.files import write_atomically
+from saccade._internal.files import sha256_of, write_atomically
 from saccade.cli import EXIT_INTERRUPTED, EXIT_OK, output
-from saccade.errors import SaccadeError
+from saccade.errors import InputError, SaccadeError
 from saccade_lab import flags as lab_flags
 from saccade_lab.extras import LAB, require
 from saccade_lab.files import path_text, writable_directory
@@ -29,6 +29,8 @@ if TYPE_CHECKING:
 
 #: Options that may be paths of files.
 FILES = ("data_config", "tokenizer")
+#: Protocols whose programs fail after the last official state; others begin again with the first one.
+END_WITH_STATES = ("isaac-n15",)
 
 HELP = "run a policy on LIBERO and report how often it succeeds, by a released protocol"
 EXTRAS = LAB
@@ -136,6 +138,12 @@ class Session:
         self.results.add(rolled.episode)
         self.results.write(self.out, self.about)
 
+    def without_video(self) -> str:
+        """How many episodes have no video, in words; nothing if all have one."""
+        done = list(self.results.episodes)
+        count = sum(not (self.out / f"videos/{'-'.join(map(str, key))}.mp4").is_file() for key in done)
+        return f" ({count} of {len(done)} episodes have none: they ran without --video)" if count else ""
+
     def progress(self, begun: float, count: int, total: int) -> str:
         """How many have succeeded, and when the last episode is expected to end."""
         own = [self.results.episodes[item] for item in self.items if item in self.results.episodes]
@@ -187,13 +195,14 @@ def prepare(args: argparse.Namespace, workers: Workers) -> Session:
     from saccade_lab.libero import packages
     from saccade_lab.libero.episode import Noise
     from saccade_lab.libero.episodes import Episodes
-    from saccade_lab.libero.results import Results
-    from saccade_lab.libero.suites import find_suite, find_task
+    from saccade_lab.libero.results import Results, software
+    from saccade_lab.libero.suites import find_suite
     from saccade_lab.sim import graphics
 
     packages.require()
     graphics.check()
-    checkpoint = locate(args.checkpoint).path
+    location = locate(args.checkpoint)
+    checkpoint = location.path
     options = arguments.policy_options(args)
     options["num_threads"] = args.num_threads if workers.alone else workers.num_threads
     given = {name: Path(options[name]) for name in FILES if options[name] is not None}
@@ -207,12 +216,21 @@ def prepare(args: argparse.Namespace, workers: Workers) -> Session:
         sha256 = weights_hash(checkpoint)
     settings = {
         "protocol": policy.record(list(args.suite)),
-        "checkpoint": {"name": checkpoint.resolve().name, "sha256": sha256},
-        "options": {
-            **{name: value for name, value in options.items() if name != "num_threads"},
-            "hashes": {name: weights_hash(path) for name, path in found.items()},
+        "checkpoint": {
+            "name": location.id or checkpoint.resolve().name,
+            "commit": location.commit,
+            "sha256": sha256,
+        },
+        "options": {name: value for name, value in options.items() if name not in ("num_threads", *found)},
+        "option_files": {
+            name: {
+                "name": path.resolve().name,
+                "sha256": weights_hash(path) if path.is_dir() else sha256_of(path),
+            }
+            for name, path in found.items()
         },
         "noise": vars(noise),
+        **software(),
     }
     results = Results.begin(args.out, settings)
     items = [
@@ -221,13 +239,11 @@ def prepare(args: argparse.Namespace, workers: Workers) -> Session:
         for task in lab_flags.indices("--tasks", args.tasks, suite.num_tasks)
         for trial in range(args.trials)
     ]
-    ran = {(suite, task) for suite, task, _ in (*results.episodes, *items)}
+    tasks = tasks_of(policy, {(suite, task) for suite, task, _ in (*results.episodes, *items)})
+    check_trials(policy, tasks, args.trials)
     about = {
-        "tasks": [
-            {"suite": suite, "task": task, "instruction": find_task(suite, task).instruction}
-            for suite, task in sorted(ran)
-        ],
-        "engine": engine(policy),
+        "tasks": tasks,
+        "engine": {"num_threads": policy.whole.head.num_threads},
         "processes": {"backend": workers.backend, "jobs": workers.jobs},
     }
     if not args.json:
@@ -235,12 +251,29 @@ def prepare(args: argparse.Namespace, workers: Workers) -> Session:
     return Session(episodes, items, results, workers, args.out, about)
 
 
-def engine(policy: LiberoPolicy) -> dict[str, Any]:
-    """What computes, for the results."""
-    import saccade
+def tasks_of(policy: LiberoPolicy, ran: Iterable[tuple[str, int]]) -> list[dict[str, Any]]:
+    """Tasks for the results: instruction, and number of official states if episodes begin in these."""
+    from saccade_lab.libero.suites import find_task, initial_states
 
-    config = saccade.show_config("dicts")
-    return {"instruction_set": config["isa"], "num_threads": policy.whole.head.num_threads}
+    found = []
+    for suite, number in sorted(ran):
+        task = find_task(suite, number)
+        states = len(initial_states(task)) if policy.protocol.official_states else None
+        found.append(
+            {"suite": suite, "task": number, "instruction": task.instruction, "official_states": states}
+        )
+    return found
+
+
+def check_trials(policy: LiberoPolicy, tasks: Iterable[Mapping[str, Any]], trials: int) -> None:
+    """Refuses trials that the protocol's program does not have."""
+    name = policy.protocol.name
+    for task in tasks if name in END_WITH_STATES else ():
+        if trials > task["official_states"]:
+            raise InputError(
+                f"--trials: given {trials}, expected at most {task['official_states']}: the program of "
+                f"{name} ends with the last official state of {task['suite']} {task['task']}"
+            )
 
 
 def announce(policy: LiberoPolicy, protocol: Mapping[str, Any]) -> None:
@@ -276,14 +309,17 @@ def show(session: Session, record: Mapping[str, Any]) -> None:
     output.show(
         [
             output.Section(
-                f"Success by the protocol {record['protocol']['name']}, with Wilson's intervals",
+                f"Success by the protocol {record['protocol']['name']}, with Wilson's intervals"
+                + (", all episodes with the same noise" if record["noise"]["is_common"] else ""),
                 ["", "instruction", ">success", ">%", ">95 %", ">steps"],
                 rows,
             )
         ]
     )
+    for remark in record["remarks"]:
+        print(remark)
     print(f"seconds in an episode: {spent}")
     print(f"results  {session.out / 'results.json'}")
     print(f"page     {session.out / 'index.html'}")
     if session.episodes.video:
-        print(f"videos   {session.out / 'videos'}")
+        print(f"videos   {session.out / 'videos'}{session.without_video()}")

@@ -144,7 +144,9 @@ class LiberoEnvironment(gymnasium.Env[LiberoObservation, npt.NDArray[np.float32]
         truncated = self.steps >= self.max_steps and not outcome.success
         return self.observe(), outcome.reward, outcome.success, truncated, {"success": outcome.success}
 
-    def restart(self, state: int | None, seed: int | None, *, resets: int = 1, loads: int = 1) -> None:
+    def restart(
+        self, state: int | None, seed: int | None, *, resets: int = 1, loads: int | None = None
+    ) -> None:
         """Like ``reset``, without drawing an observation.
 
         Cabinets and stoves stand where the reset draws them, also with an official state. Where they stand
@@ -159,7 +161,8 @@ class LiberoEnvironment(gymnasium.Env[LiberoObservation, npt.NDArray[np.float32]
             state: Number of the official initial state. None for the layout that the reset draws.
             seed: Of the layout, below 2^32. None continues the random numbers of the last episode.
             resets: Number of resets after the seed, 2 seconds each; the last one starts the episode.
-            loads: Number of earlier resets without a seed of their own, and 1 for the construction.
+            loads: Number of earlier resets that count, and 1 for the construction. None for 1 with a seed,
+                and without one for those that there were, attempts without room for all objects included.
 
         Raises:
             InputError: An argument is out of range, or ``state`` does not fit ``official_states``.
@@ -177,14 +180,14 @@ class LiberoEnvironment(gymnasium.Env[LiberoObservation, npt.NDArray[np.float32]
         if seed is not None and not 0 <= seed < SEEDS:
             raise InputError(f"seed: given {seed}, expected 0 to {SEEDS - 1}")
         for name, value in (("resets", resets), ("loads", loads)):
-            if value < 1:
+            if value is not None and value < 1:
                 raise InputError(f"{name}: given {value}, expected at least 1")
         self._close_renderer()  # its model is about to be replaced
         self.simulation.restart(
             None if state is None or states is None else states[state],
             seed,
             resets=resets,
-            loads=loads,
+            loads=1 if loads is None and seed is not None else loads,
             settle_steps=self.settle_steps,
         )
         self.steps = 0

@@ -18,6 +18,9 @@ from saccade_lab.training import dataset
 from saccade_lab.training.dataset import Samples
 
 SETTINGS_FILE = "recording.json"
+#: Version of what else decides an episode: the expert and its grasps, placements, bursts, numbers of steps.
+#: Whoever changes one of them raises it, so that a recording does not go on with other episodes.
+EXPERT = 1
 
 
 @dataclass(frozen=True)
@@ -30,6 +33,7 @@ class LiberoRecording:
         instruction: What a policy is told.
         image_size: Pixels along each side of a frame.
         frame_stride: Control steps between recorded observations.
+        expert: The ``EXPERT`` that recorded it.
     """
 
     suite: str
@@ -37,6 +41,7 @@ class LiberoRecording:
     instruction: str
     image_size: int = 256
     frame_stride: int = 5
+    expert: int = EXPERT
 
     @property
     def name(self) -> str:
@@ -68,7 +73,7 @@ def read_recordings(directory: Path) -> list[LiberoRecording]:
         found.append(LiberoRecording(**values))
     if not found:
         raise FileNotFoundError(f"{directory}: no demonstrations found; `saccade demos --env` records them")
-    if len({(one.suite, one.image_size, one.frame_stride) for one in found}) > 1:
+    if len({(one.suite, one.image_size, one.frame_stride, one.expert) for one in found}) > 1:
         raise InputError(f"{directory}: the tasks were recorded with different settings")
     return sorted(found, key=lambda one: one.task)
 

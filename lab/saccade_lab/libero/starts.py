@@ -5,7 +5,9 @@ from __future__ import annotations
 from saccade_lab.libero.environment import LiberoEnvironment
 from saccade_lab.libero.protocols import EVERY_EPISODE, Protocol
 
-#: How often lerobot has loaded the model before it seeds its first episode.
+#: How often lerobot has loaded the model before it seeds its first episode. It loads it once more for each
+#: trial, and again where a layout had no room for all objects, which is not counted: a trial depends on its
+#: number only.
 LEROBOT_LOADS = 2
 
 
@@ -31,10 +33,11 @@ class Starts:
             loads = LEROBOT_LOADS + trial if self.protocol.lerobot_form else 1
             self.environment.restart(state, seed, loads=loads)
             return
-        if 0 < self._next <= trial:  # the program's own reset, after those of the trials between
-            self.environment.restart(state, None, resets=1 + trial - self._next, loads=1 + self._next)
-        else:
-            self.environment.restart(state, seed, resets=1 + trial)
+        # Either the program's own reset, after those of the trials between, or all of them from the seed.
+        goes_on = 0 < self._next <= trial
+        resets = 1 + trial - (self._next if goes_on else 0)
+        self._next = 0  # all of them next time, should this one be interrupted
+        self.environment.restart(state, None if goes_on else seed, resets=resets)
         self._next = trial + 1
 
     def close(self) -> None:

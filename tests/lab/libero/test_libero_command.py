@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import json
 import pickle
+import shutil
 from collections.abc import Callable
 from importlib import resources
 from pathlib import Path
@@ -14,6 +15,8 @@ from typing import Any
 import pytest
 
 from saccade import cli
+from saccade._internal import hub
+from saccade.errors import InputError
 from saccade_lab.cli.libero import prepare
 from saccade_lab.libero import episodes, packages, suites
 from saccade_lab.libero.policy import LiberoPolicy
@@ -41,6 +44,7 @@ def made(monkeypatch: pytest.MonkeyPatch) -> list[StandIn]:
     monkeypatch.setattr(packages, "require", lambda: None)
     monkeypatch.setattr(graphics, "check", lambda: None)
     monkeypatch.setattr(suites, "find_task", find_task)
+    monkeypatch.setattr(suites, "initial_states", lambda task: range(50))
     monkeypatch.setattr(episodes, "environment_for", environment_for)
     return found
 
@@ -67,7 +71,14 @@ def test_the_pinned_command(
     ]
     assert record["protocol"]["name"] == "isaac-n17"
     assert record["protocol"]["max_steps"] == {"libero_object": 720}
-    assert record["tasks"] == [{"suite": "libero_object", "task": 0, "instruction": "do 0 of libero_object"}]
+    assert record["tasks"] == [
+        {
+            "suite": "libero_object",
+            "task": 0,
+            "instruction": "do 0 of libero_object",
+            "official_states": None,
+        }
+    ]
     assert [one.starts for one in made] == [[(None, 0, 1, 1), (None, 1, 1, 1)]]
     assert [one.is_closed for one in made] == [True]
     out = tmp_path / "out"
@@ -144,9 +155,91 @@ def test_other_machines_find_the_files(
     assert there.options["data_config"] == "/elsewhere/mine.json"
     assert pickle.loads(pickle.dumps(there)) == there
     # A file with other content under the same name is another option.
-    before = session.results.settings["options"]
+    (tmp_path / "out/libero").mkdir(parents=True)
+    session.results.write(tmp_path / "out/libero", session.about)
+    assert not prepare(args, Workers()).results.episodes
     (tmp_path / "mine.json").write_text((tmp_path / "mine.json").read_text() + "\n")
-    assert prepare(args, Workers()).results.settings["options"] != before
+    with pytest.raises(InputError, match=r"another run: other options\.data_config\. Choose"):
+        prepare(args, Workers())
+
+
+def test_trials_beyond_the_official_states(
+    run: Run, made: list[StandIn], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(suites, "initial_states", lambda task: range(2))
+    record = run("--tasks", "0", "--trials", "3", "--protocol", "lerobot", "--same-noise")
+    remark = "libero_object 0 has 2 official states: 1 episodes repeat one"
+    assert [one[: len(remark)] for one in record["remarks"][1:]] == [remark]
+    printed = capsys.readouterr().out
+    assert remark in printed
+    assert "all episodes with the same noise" in printed
+
+
+def test_n15_ends_with_the_official_states(
+    made: list[StandIn], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    words = ["libero", str(checkpoint("n1.5")), "--data-config", DATA_CONFIG, "--out", str(out)]
+    assert cli.main([*words, "--tasks", "1", "--trials", "51"]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "--trials: given 51, expected at most 50: the program of isaac-n15 ends with the last" in line
+    assert "libero_object 1" in line
+    assert not out.exists()
+    assert not made
+
+
+class Film:
+    """A video file without a codec."""
+
+    def __init__(self, path: Path, frames_per_second: float) -> None:
+        self.path = path
+
+    def __enter__(self) -> Film:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.path.write_bytes(b"video")
+
+    def append(self, picture: object) -> None:
+        """Forgets it."""
+
+
+def test_a_video_changes_nothing_else(
+    run: Run,
+    made: list[StandIn],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(episodes, "VideoWriter", Film)
+    out = tmp_path / "out"
+    first = run("--tasks", "0", "--trials", "1")
+    picture = (out / "pictures" / "libero_object-0-0.png").read_bytes()
+    (out / "results.json").unlink()
+    assert run("--tasks", "0", "--trials", "1", "--video")["episodes"] == first["episodes"]
+    assert (out / "pictures" / "libero_object-0-0.png").read_bytes() == picture
+    assert "none" not in capsys.readouterr().out.partition("\nvideos ")[2]
+    (out / "videos" / "libero_object-0-0.mp4").unlink()
+    run("--tasks", "0", "--trials", "2", "--video")
+    assert "(1 of 2 episodes have none: they ran without --video)" in capsys.readouterr().out
+    assert [path.name for path in (out / "videos").iterdir()] == ["libero_object-0-1.mp4"]
+
+
+def test_a_renamed_folder_goes_on_and_a_published_one_is_named(
+    made: list[StandIn], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = tmp_path / "out"
+    for name in ("one", "other"):
+        shutil.copytree(checkpoint("n1.7"), tmp_path / name)
+    words = ["--tasks", "0", "--trials", "1", "--out", str(out)]
+    assert cli.main(["libero", str(tmp_path / "one"), *words]) == 0
+    assert cli.main(["libero", str(tmp_path / "other"), *words]) == 0
+    assert len(made) == 1
+    location = hub.Location(tmp_path / "one", "somebody/policy", "a" * 40)
+    monkeypatch.setattr(hub, "locate_published", lambda *rest, **more: location)
+    assert cli.main(["libero", "somebody/policy", *words]) == 0
+    found = json.loads((out / "results.json").read_text())["checkpoint"]
+    assert (found["name"], found["commit"]) == ("somebody/policy", "a" * 40)
 
 
 def test_json_alone_is_printed(run: Run, capsys: pytest.CaptureFixture[str]) -> None:

@@ -8,13 +8,15 @@ from copy import deepcopy
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from scipy.stats import norm
 
+import saccade
 from saccade.errors import InputError
 from saccade_lab.libero.episode import PARTS, Episode
 from saccade_lab.libero.page import write_page
-from saccade_lab.libero.results import Results
+from saccade_lab.libero.results import Results, software
 
 SETTINGS: dict[str, Any] = {
     "protocol": {
@@ -33,13 +35,24 @@ SETTINGS: dict[str, Any] = {
         "gripper": {"rule": "as given", "reason": "statistics"},
         "cameras": {"image": "image", "wrist_image": "wrist_image"},
     },
-    "checkpoint": {"name": "small", "sha256": "0" * 64},
+    "checkpoint": {"name": "small", "commit": None, "sha256": "0" * 64},
     "options": {"precision": {"backbone": "float32", "head": "float32"}},
+    "option_files": {"tokenizer": {"name": "words.json", "sha256": "2" * 64}},
     "noise": {"seed": 0, "is_common": False},
+    "saccade": "1.0",
+    "instruction_set": "avx2",
+    "packages": {"numpy": "2.0", "mujoco": "3.3.0"},
 }
-ABOUT = {
-    "tasks": [{"suite": "libero_object", "task": 0, "instruction": "pick <b>up</b> & place"}],
-    "engine": {"instruction_set": "avx2", "num_threads": 1},
+ABOUT: dict[str, Any] = {
+    "tasks": [
+        {
+            "suite": "libero_object",
+            "task": 0,
+            "instruction": "pick <b>up</b> & place",
+            "official_states": None,
+        }
+    ],
+    "engine": {"num_threads": 1},
 }
 
 
@@ -145,7 +158,12 @@ def changed(path: tuple[str, ...], value: Any) -> dict[str, Any]:
         (("protocol", "max_steps", "libero_object"), 280, r"protocol.max_steps \(libero_object\)"),
         (("checkpoint", "sha256"), "1" * 64, "checkpoint"),
         (("options", "precision"), "int8", "options"),
+        (("option_files", "tokenizer", "sha256"), "1" * 64, "options.tokenizer"),
+        (("option_files",), {}, "options.tokenizer"),
         (("noise", "seed"), 1, "noise"),
+        (("saccade",), "1.1", "saccade"),
+        (("instruction_set",), "avx512", "instruction_set"),
+        (("packages", "mujoco"), "3.3.1", "packages.mujoco"),
     ],
 )
 def test_episodes_of_another_run_are_refused_by_name(
@@ -154,6 +172,71 @@ def test_episodes_of_another_run_are_refused_by_name(
     filled().write(tmp_path, ABOUT)
     with pytest.raises(InputError, match=f"another run: other {named}. Choose"):
         Results.begin(tmp_path, changed(path, value))
+
+
+def test_names_do_not_matter_where_contents_are_equal(tmp_path: Path) -> None:
+    filled().write(tmp_path, ABOUT)
+    other = changed(("checkpoint", "name"), "renamed")
+    other["checkpoint"]["commit"] = "a" * 40
+    other["option_files"]["tokenizer"]["name"] = "elsewhere.json"
+    assert Results.begin(tmp_path, other).episodes == filled().episodes
+
+
+def test_software_is_what_runs_here() -> None:
+    found = software()
+    assert found["saccade"] == saccade.__version__
+    assert found["instruction_set"] == saccade.show_config("dicts")["isa"]
+    assert found["packages"]["numpy"] == np.__version__
+    assert set(found) < set(SETTINGS)
+
+
+@pytest.mark.parametrize(
+    ("part", "name", "value", "message"),
+    [
+        ("episodes", "success", "no", "libero_object 0 0: success is 'no', expected true or false"),
+        ("episodes", "success", 1, "success is 1, expected true or false"),
+        ("episodes", "task", 10, "task is 10, expected an integer from 0 to 9"),
+        ("episodes", "task", True, "task is True"),
+        ("episodes", "trial", -1, "trial is -1"),
+        ("episodes", "trial", 0.0, "trial is 0.0"),
+        ("episodes", "trial", 1, "libero_object 0 1 is there twice"),
+        ("episodes", "suite", "libero_kitchen", "given 'libero_kitchen'"),
+        ("episodes", "suite", "libero_goal", "KeyError"),
+        ("episodes", "steps", 721, "steps is 721, expected an integer from 1 to 720"),
+        ("episodes", "steps", 0, "steps is 0"),
+        ("episodes", "steps", "90", "steps is '90'"),
+        ("episodes", "colour", 1, "colour"),
+        ("costs", "chunks", 101, "chunks is 101, expected an integer from 1 to 100"),
+        ("costs", "seconds", {}, "seconds are {}"),
+        ("costs", "seconds", dict.fromkeys(PARTS, -1), "seconds are"),
+        ("costs", "seconds", dict.fromkeys(PARTS, float("nan")), "seconds are"),
+        ("costs", "seconds", dict.fromkeys(PARTS, "1"), "seconds are"),
+    ],
+)
+def test_damaged_episodes_are_refused(tmp_path: Path, part: str, name: str, value: Any, message: str) -> None:
+    record = filled().record(ABOUT)
+    record[part][0][name] = value
+    (tmp_path / "results.json").write_text(json.dumps(record))
+    with pytest.raises(InputError, match=rf"results\.json has no results.*{re.escape(message)}"):
+        Results.begin(tmp_path, SETTINGS)
+
+
+def test_what_intervals_do_not_count_is_said(tmp_path: Path) -> None:
+    assert filled().record(ABOUT)["remarks"] == []
+    results = filled(changed(("noise", "is_common"), True))
+    about = {**ABOUT, "tasks": [{**ABOUT["tasks"][0], "official_states": 2}]}
+    noise, states = results.record(about)["remarks"]
+    assert noise.startswith("The noise is the same in every episode")
+    assert states.startswith("libero_object 0 has 2 official states: 1 episodes repeat one")
+    write_page(results.record(about), tmp_path)
+    text = (tmp_path / "index.html").read_text()
+    assert noise in text
+    assert states in text
+
+
+def test_the_page_names_a_commit(tmp_path: Path) -> None:
+    write_page(filled(changed(("checkpoint", "commit"), "a" * 40)).record(ABOUT), tmp_path)
+    assert f"Commit {'a' * 12}, weights 0000" in (tmp_path / "index.html").read_text()
 
 
 @pytest.mark.parametrize(

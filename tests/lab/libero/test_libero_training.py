@@ -26,9 +26,10 @@ from saccade_lab.libero.checkpoint import (
     recorded_statistics,
 )
 from saccade_lab.libero.policy import LiberoPolicy
-from saccade_lab.libero.recording import describe, is_recording, load_samples, read_recordings
+from saccade_lab.libero.recording import EXPERT, describe, is_recording, load_samples, read_recordings
 from saccade_lab.libero.sizes import libero_config
 from saccade_lab.reference import ActionHead, Backbone
+from saccade_lab.sim import demos as sim_demos
 from saccade_lab.training.batches import Batches, prompts_of
 from saccade_lab.training.frozen import backbone_inputs
 from saccade_lab.training.settings import LIBERO_SETTINGS, released_std
@@ -279,9 +280,12 @@ def test_recordings_that_do_not_fit_are_refused(recording: Path, tmp_path: Path)
         load_samples(other, tasks, 16, processor)
     path = other / "libero_object-1" / "recording.json"
     values = json.loads(path.read_text())
-    path.write_text(json.dumps({**values, "frame_stride": 9}))
-    with pytest.raises(InputError, match="different settings"):
-        read_recordings(other)
+    for changed in ({"frame_stride": 9}, {"expert": EXPERT + 1}):
+        path.write_text(json.dumps({**values, **changed}))
+        with pytest.raises(InputError, match="different settings"):
+            read_recordings(other)
+    with pytest.raises(InputError, match="other settings"):  # nor are episodes of another expert added
+        sim_demos.claim_directory(path, tasks[1])
     path.write_text(json.dumps({"cameras": [], "image_size": 68, "frame_stride": 3}))
     with pytest.raises(InputError, match="expected a recording of LIBERO"):
         read_recordings(other)
