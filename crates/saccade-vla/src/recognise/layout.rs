@@ -2,7 +2,6 @@
 
 use std::path::Path;
 
-use super::lerobot;
 use super::sizes::HeadShapes;
 use crate::config::CheckpointConfig;
 use crate::release::Version;
@@ -37,6 +36,9 @@ pub(super) struct Layout {
     matches: fn(&Contents<'_>) -> bool,
 }
 
+/// What the names of the head's tensors begin with in lerobot's checkpoints.
+const LEROBOT_PREFIX: &str = "_groot_model.action_head.";
+
 /// Keys that a config of a whole model has.
 const BACKBONE_KEYS: [&str; 3] = ["backbone_cfg", "backbone_model_type", "model_name"];
 
@@ -45,14 +47,14 @@ pub(super) static LAYOUTS: [Layout; 5] = [
     // lerobot's of a fork with several action decoders.
     Layout {
         name: "fork",
-        prefix: Some(lerobot::PREFIX),
+        prefix: Some(LEROBOT_PREFIX),
         matches: |contents| contents.tensors.has_several_decoders(),
     },
     Layout {
         name: "lerobot",
-        prefix: Some(lerobot::PREFIX),
+        prefix: Some(LEROBOT_PREFIX),
         matches: |contents| {
-            contents.tensors.prefix == lerobot::PREFIX || contents.config.top().contains_key("type")
+            contents.tensors.prefix == LEROBOT_PREFIX || contents.config.top().contains_key("type")
         },
     },
     // A head of saccade's own, or a head alone.

@@ -10,9 +10,6 @@ use crate::config::{CheckpointConfig, OWN_KEY, Object, object_in_any};
 use crate::error::{Error, Result, ensure, problem};
 use crate::release::{Feature, Version};
 
-/// What the names of the head's tensors begin with.
-pub(super) const PREFIX: &str = "_groot_model.action_head.";
-
 /// `type` in lerobot's `config.json` of a GR00T policy.
 const POLICY: &str = "groot";
 
