@@ -27,13 +27,16 @@ class Stopped(Exception):
 
 @contextmanager
 def stopped_after(seconds: float) -> Iterator[None]:
-    """Raises `Stopped` in the main thread once this long has passed."""
+    """Raises `Stopped` in the main thread once this long has passed.
+
+    And every two seconds after that: Python drops what is raised within a callback of its garbage collector.
+    """
 
     def stop(*_: object) -> None:
         raise Stopped
 
     before = signal.signal(signal.SIGALRM, stop)
-    signal.setitimer(signal.ITIMER_REAL, seconds)
+    signal.setitimer(signal.ITIMER_REAL, seconds, 2.0)
     try:
         yield
     finally:
