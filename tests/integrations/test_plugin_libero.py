@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import importlib.util
 from dataclasses import replace
-from types import ModuleType
 
 import numpy as np
 import pytest
@@ -14,21 +12,9 @@ from saccade.errors import InputError
 from saccade.robots.libero import EXECUTED_STEPS
 from saccade_lab.libero.policy import LiberoPolicy
 from tests.helpers.libero_runs import checkpoint, seen, whole
-from tests.helpers.paths import ROOT
+from tests.helpers.plugin_module import plugin_module
 
-
-def plugin() -> ModuleType:
-    """The module by its path, since the package imports lerobot."""
-    path = ROOT / "plugins" / "lerobot" / "lerobot_policy_saccade" / "libero.py"
-    spec = importlib.util.spec_from_file_location("plugin_libero", path)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-libero = plugin()
+libero = plugin_module("libero")
 
 
 def test_a_raw_checkpoint_acts_as_in_the_command() -> None:

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
 from pathlib import Path
-from types import ModuleType, SimpleNamespace
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -14,6 +13,7 @@ from safetensors.torch import load_file
 
 import saccade
 from saccade_lab.reference.chunking import start_of
+from tests.helpers.plugin_module import plugin_module
 
 ROOT = Path(__file__).resolve().parents[2]
 DATA = ROOT / "tests" / "data" / "rtc_lerobot"
@@ -21,18 +21,7 @@ CASES: list[dict[str, Any]] = json.loads((DATA / "dev.json").read_text())
 RULE = saccade.Chunking(overlap=0, frozen=0)
 
 
-def plugin() -> ModuleType:
-    """The module by its path, since the package imports lerobot."""
-    path = ROOT / "plugins" / "lerobot" / "lerobot_policy_saccade" / "real_time_chunking.py"
-    spec = importlib.util.spec_from_file_location("real_time_chunking", path)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-continued = plugin().continued
+continued = plugin_module("real_time_chunking").continued
 
 
 @pytest.mark.parametrize("case", CASES, ids=lambda case: str(case["case"]))

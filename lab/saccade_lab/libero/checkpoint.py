@@ -6,7 +6,6 @@ the two fingers, an action of ``OSC_POSE``, relative to the hand, and a gripper 
 
 from __future__ import annotations
 
-import re
 import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -25,7 +24,9 @@ from saccade_lab.sim.settings import (
     CROP_SHARE,
     DATA_CONFIG_FILE,
     METADATA_FILE,
+    n15_config,
     statistics_of,
+    vocabulary,
 )
 
 CONFIG_FILE, TOKENIZER_FILE = "config.json", "tokenizer.json"
@@ -121,8 +122,8 @@ class LiberoConfig:
 
     def to_dict(self) -> dict[str, Any]:
         """The content of ``config.json``."""
-        inner = eagle_config(self.version, self.backbone)
         if self.version == "n1.7":
+            inner = eagle_config(self.version, self.backbone)
             return {
                 **self.head,
                 "architectures": ["Gr00tN1d7"],
@@ -131,19 +132,7 @@ class LiberoConfig:
                 "use_relative_action": False,
                 "backbone_cfg": {"select_layer": self.backbone["select_layer"], "eagle_config": inner},
             }
-        return {
-            "model_type": "gr00t_n1_5",
-            "architectures": ["GR00T_N1_5"],
-            "action_dim": self.head["action_dim"],
-            "action_horizon": self.head["action_horizon"],
-            "hidden_size": self.head["backbone_embedding_dim"],
-            "action_head_cfg": dict(self.head),
-            "backbone_cfg": {
-                "select_layer": self.backbone["select_layer"],
-                "project_to_dim": None,
-                "eagle_config": inner,
-            },
-        }
+        return n15_config(self.head, self.backbone)
 
     def metadata(self) -> dict[str, Any]:
         """Statistics by embodiment and kind; with N1.5 the content of ``experiment_cfg/metadata.json``."""
@@ -243,8 +232,3 @@ def policy_actions(actions: Float32Array) -> Float32Array:
     changed = actions.copy()
     changed[..., -1] = 0.5 - 0.5 * actions[..., -1]
     return changed
-
-
-def vocabulary(said: Sequence[str]) -> tuple[str, ...]:
-    """The words of instructions, each of which becomes a token."""
-    return tuple(sorted(set(re.findall("[a-z]+", " ".join(said)))))

@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from saccade._internal.arrays import Float32Array
 from saccade.datasets import Writer
 from saccade.errors import InputError
 from saccade_lab.libero.checkpoint import ACTION_GROUPS, CAMERAS, CONTROL_HZ, STATE_GROUPS, policy_actions
@@ -35,7 +34,6 @@ DEFAULT_COUNT = 40
 IMAGE_SIZE, FRAME_STRIDE = 256, 5
 MAX_STEPS = 280  # as in evaluations; the expert needs 80 to 210
 SETTLE_STEPS = 10
-STEPS_AFTER_SUCCESS = 8  # so that the last chunks show how to let go
 GOAL = "basket_1"
 ROBOT = "libero_panda"
 #: Milder than Meta-World's, because a step moves the hand further: up to 5 cm instead of 1.
@@ -85,29 +83,18 @@ def record_episode(
 ) -> demos.Demonstration | None:
     """Records one episode of the expert; None if it did not succeed. For ``environment`` see ``start``."""
     scene = start(environment, settings.task, seed)
-    expert = BasketExpert(scene)
-    bursts = NoiseBursts(np.random.default_rng((settings.task, seed, 1)), **BURSTS)
-    frames: list[tuple[Any, ...]] = []
-    actions: list[Float32Array] = []
-    disturbed: list[bool] = []
-    steps_left, succeeded = MAX_STEPS, False
-    while steps_left > 0:
-        if len(actions) % settings.frame_stride == 0:
-            seen = environment.observe()
-            images = np.stack([seen["images"][name] for name in CAMERAS])
-            frames.append((images, seen["state"], scene.targets(), np.int32(len(actions))))
-        action = expert.action()
-        executed, replaced = bursts.apply(action)
-        actions.append(action)
-        disturbed.append(replaced)
-        steps_left -= 1
-        if environment.advance(executed).success and not succeeded:
-            succeeded, steps_left = True, min(steps_left, STEPS_AFTER_SUCCESS)
-    if not succeeded:
-        return None
-    images, proprio, targets, frame_steps = map(np.stack, zip(*frames, strict=True))
-    return demos.Demonstration(
-        images, proprio, targets, frame_steps, np.stack(actions), np.array(disturbed, dtype=np.bool_)
+
+    def look() -> demos.Look:
+        seen = environment.observe()
+        return np.stack([seen["images"][name] for name in CAMERAS]), seen["state"], scene.targets()
+
+    return demos.demonstrated(
+        BasketExpert(scene).action,
+        environment.advance,
+        look,
+        NoiseBursts(np.random.default_rng((settings.task, seed, 1)), **BURSTS),
+        frame_stride=settings.frame_stride,
+        max_steps=MAX_STEPS,
     )
 
 

@@ -12,11 +12,11 @@ from saccade_lab.libero.checkpoint import (
     STATE_DIM,
     VERSIONS,
     LiberoConfig,
-    vocabulary,
 )
 from saccade_lab.random_checkpoint.tokenizer import token_id
-from saccade_lab.sim.settings import backbone_config, head_config
+from saccade_lab.sim.settings import vocabulary
 from saccade_lab.training.settings import TrainingSettings
+from saccade_lab.training.sizes import small_configs
 
 MERGE = 2  # patches along each side of an image token, in both versions
 
@@ -52,26 +52,11 @@ def libero_config(settings: TrainingSettings, said: Sequence[str], frame_size: i
             f"language_dropout: given {settings.language_dropout}, expected 0 with n1.7, which has no "
             "default for a missing instruction"
         )
-    head = head_config(
-        width=settings.width,
-        features_width=settings.features_width,
-        num_layers=settings.num_layers,
-        num_heads=settings.num_heads,
-        vl_num_layers=settings.vl_num_layers,
-        num_future_tokens=settings.num_future_tokens,
-        horizon=settings.horizon,
-        num_steps=settings.num_steps,
+    words = vocabulary(said)
+    head, backbone = small_configs(
+        settings,
         state_dim=STATE_DIM,
         action_dim=ACTION_DIM,
-    )
-    words = vocabulary(said)
-    backbone = backbone_config(
-        width=settings.features_width,
-        num_layers=settings.language_layers,
-        num_heads=settings.num_heads,
-        vision_width=settings.vision_width,
-        vision_layers=settings.vision_layers,
-        vision_heads=settings.vision_heads,
         image_size=frame_size,
         patch_size=side,
         words=words,

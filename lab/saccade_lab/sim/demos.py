@@ -15,11 +15,12 @@ import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
+from saccade._internal.arrays import Float32Array
 from saccade._internal.files import write_atomically, write_json
 from saccade.errors import InputError, SaccadeError
 from saccade_lab.parallel import ALONE, Lost, Workers, each
@@ -30,6 +31,7 @@ from saccade_lab.sim.tasks import DEMO_TASKS, DEMONSTRATION_SEEDS, STUDY_TASKS, 
 
 if TYPE_CHECKING:
     from saccade_lab.sim.environment import TaskEnvironment
+    from saccade_lab.sim.scenarios import StepOutcome
 
 MAX_STEPS = 250  # bursts lengthen the expert's path
 STEPS_AFTER_SUCCESS = 8  # so that the last chunks show how to stay
@@ -78,6 +80,10 @@ class RecordingSettings:
         return cls(int(values["image_size"]), int(values["frame_stride"]), cameras)
 
 
+#: Images ``(cameras, H, W, 3)`` uint8, proprioception and targets of one moment.
+Look: TypeAlias = tuple[npt.NDArray[np.uint8], Float32Array, Float32Array]
+
+
 @dataclass(frozen=True)
 class Demonstration:
     """One recorded episode of ``steps`` control steps and ``frames`` observations.
@@ -110,39 +116,61 @@ def record_episode(
 ) -> Demonstration | None:
     """Records one episode of the expert; None if it did not succeed."""
     environment.restart(seed)
-    expert = Expert(environment)
     task_number = list(TASKS).index(environment.task.name)
-    bursts = NoiseBursts(np.random.default_rng((task_number, seed)))
-    images: list[npt.NDArray[np.uint8]] = []
-    proprio: list[npt.NDArray[np.float32]] = []
-    targets: list[npt.NDArray[np.float32]] = []
-    frame_steps: list[int] = []
-    actions: list[npt.NDArray[np.float32]] = []
+
+    def look() -> Look:
+        seen = environment.observe()
+        images = np.stack(list(seen["images"].values()))
+        return images, seen["proprio"], environment.privileged_targets()
+
+    return demonstrated(
+        Expert(environment).action,
+        environment.advance,
+        look,
+        NoiseBursts(np.random.default_rng((task_number, seed))),
+        frame_stride=settings.frame_stride,
+        max_steps=MAX_STEPS,
+    )
+
+
+def demonstrated(
+    expert: Callable[[], Float32Array],
+    advance: Callable[[Float32Array], StepOutcome],
+    look: Callable[[], Look],
+    bursts: NoiseBursts,
+    *,
+    frame_stride: int,
+    max_steps: int,
+) -> Demonstration | None:
+    """Lets an expert act from where an episode stands; None if it does not succeed.
+
+    Args:
+        expert: Its next action.
+        advance: Executes an action.
+        look: Images, proprioception and targets of the moment.
+        bursts: Replace some of its actions.
+        frame_stride: Control steps between recorded observations.
+        max_steps: Control steps until it is given up.
+    """
+    frames: list[tuple[Any, ...]] = []
+    actions: list[Float32Array] = []
     disturbed: list[bool] = []
-    steps_left, succeeded = MAX_STEPS, False
+    steps_left, succeeded = max_steps, False
     while steps_left > 0:
-        if len(actions) % settings.frame_stride == 0:
-            observation = environment.observe()
-            images.append(np.stack(list(observation["images"].values())))
-            proprio.append(observation["proprio"])
-            targets.append(environment.privileged_targets())
-            frame_steps.append(len(actions))
-        action = expert.action()
+        if len(actions) % frame_stride == 0:
+            frames.append((*look(), np.int32(len(actions))))
+        action = expert()
         executed, replaced = bursts.apply(action)
         actions.append(action)
         disturbed.append(replaced)
         steps_left -= 1
-        if environment.advance(executed).success and not succeeded:
+        if advance(executed).success and not succeeded:
             succeeded, steps_left = True, min(steps_left, STEPS_AFTER_SUCCESS)
     if not succeeded:
         return None
+    images, proprio, targets, frame_steps = map(np.stack, zip(*frames, strict=True))
     return Demonstration(
-        images=np.stack(images),
-        proprio=np.stack(proprio),
-        targets=np.stack(targets),
-        frame_steps=np.array(frame_steps, dtype=np.int32),
-        actions=np.stack(actions),
-        disturbed=np.array(disturbed, dtype=np.bool_),
+        images, proprio, targets, frame_steps, np.stack(actions), np.array(disturbed, dtype=np.bool_)
     )
 
 

@@ -1,8 +1,9 @@
 """What describes a small policy besides its weights: config, tokenizer and statistics, in NVIDIA's files."""
 
 import json
+import re
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -184,20 +185,7 @@ class PolicyConfig:
 
     def to_dict(self) -> dict[str, Any]:
         """The content of ``config.json``: the published keys, and ``simulation_cfg``."""
-        return {
-            "model_type": "gr00t_n1_5",
-            "architectures": ["GR00T_N1_5"],
-            "action_dim": self.head["action_dim"],
-            "action_horizon": self.head["action_horizon"],
-            "hidden_size": self.head["backbone_embedding_dim"],
-            "action_head_cfg": dict(self.head),
-            "backbone_cfg": {
-                "select_layer": self.backbone["select_layer"],
-                "project_to_dim": None,
-                "eagle_config": eagle_config("n1.5", self.backbone),
-            },
-            "simulation_cfg": self.simulation.to_dict(),
-        }
+        return {**n15_config(self.head, self.backbone), "simulation_cfg": self.simulation.to_dict()}
 
     def metadata(self) -> dict[str, Any]:
         """The content of ``experiment_cfg/metadata.json``: statistics, joints and cameras."""
@@ -257,6 +245,28 @@ def statistics_of(
             }.items()
         }
     return found
+
+
+def n15_config(head: Mapping[str, Any], backbone: Mapping[str, Any]) -> dict[str, Any]:
+    """The published keys of ``config.json`` of a whole N1.5 checkpoint."""
+    return {
+        "model_type": "gr00t_n1_5",
+        "architectures": ["GR00T_N1_5"],
+        "action_dim": head["action_dim"],
+        "action_horizon": head["action_horizon"],
+        "hidden_size": head["backbone_embedding_dim"],
+        "action_head_cfg": dict(head),
+        "backbone_cfg": {
+            "select_layer": backbone["select_layer"],
+            "project_to_dim": None,
+            "eagle_config": eagle_config("n1.5", backbone),
+        },
+    }
+
+
+def vocabulary(said: Sequence[str]) -> tuple[str, ...]:
+    """The words of instructions, each of which becomes a token."""
+    return tuple(sorted(set(re.findall("[a-z]+", " ".join(said)))))
 
 
 def head_config(

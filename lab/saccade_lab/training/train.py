@@ -14,7 +14,6 @@ continued run gives the same weights as an uninterrupted one.
 import io
 import json
 import math
-import re
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
@@ -39,9 +38,8 @@ from saccade_lab.sim.settings import (
     TENSOR_FILE,
     PolicyConfig,
     SimulationConfig,
-    backbone_config,
-    head_config,
     statistics_of,
+    vocabulary,
 )
 from saccade_lab.sim.tasks import ACTION_DIM, PROPRIO_DIM, find_task
 from saccade_lab.training.batches import Batches, prompts_of
@@ -51,6 +49,7 @@ from saccade_lab.training.learner import Learner, new_learner
 from saccade_lab.training.policy_files import PolicyFiles
 from saccade_lab.training.settings import STATE_FILE as STATE_FILE
 from saccade_lab.training.settings import TrainingSettings, features_name
+from saccade_lab.training.sizes import small_configs
 
 CHECKPOINT_SECONDS = 60.0
 VALIDATION_FRAMES = 256
@@ -90,39 +89,25 @@ def policy_config(
     settings: TrainingSettings, recording: demos.RecordingSettings, tasks: list[str]
 ) -> PolicyConfig:
     """The config of the policy that a run trains, without statistics."""
-    said = " ".join(text for name in tasks for text in find_task(name).instructions)
-    vocabulary = tuple(sorted(set(re.findall("[a-z]+", said))))
+    words = vocabulary([text for name in tasks for text in find_task(name).instructions])
+    head, backbone = small_configs(
+        settings,
+        state_dim=PROPRIO_DIM,
+        action_dim=ACTION_DIM,
+        image_size=recording.image_size,
+        patch_size=settings.patch_size,
+        words=words,
+    )
     return PolicyConfig(
-        head=head_config(
-            width=settings.width,
-            features_width=settings.features_width,
-            num_layers=settings.num_layers,
-            num_heads=settings.num_heads,
-            vl_num_layers=settings.vl_num_layers,
-            num_future_tokens=settings.num_future_tokens,
-            horizon=settings.horizon,
-            num_steps=settings.num_steps,
-            state_dim=PROPRIO_DIM,
-            action_dim=ACTION_DIM,
-        ),
-        backbone=backbone_config(
-            width=settings.features_width,
-            num_layers=settings.language_layers,
-            num_heads=settings.num_heads,
-            vision_width=settings.vision_width,
-            vision_layers=settings.vision_layers,
-            vision_heads=settings.vision_heads,
-            image_size=recording.image_size,
-            patch_size=settings.patch_size,
-            words=vocabulary,
-        ),
+        head=head,
+        backbone=backbone,
         simulation=SimulationConfig(
             tasks=tuple(tasks),
             cameras=recording.cameras,
             image_size=recording.image_size,
             execute_steps=settings.execute_steps,
         ),
-        words=vocabulary,
+        words=words,
     )
 
 
