@@ -1,4 +1,4 @@
-//! GR00T N1.9, which nobody has released: what a new release adds, as the fifth recipe of ARCHITECTURE.md has
+//! GR00T N1.9, which nobody has released: what a new release adds, as the fifth recipe of CONTRIBUTING.md has
 //! it.
 
 use saccade_vla_kernels::WeightRounding;
