@@ -47,6 +47,7 @@ INTEGERS = (
     ("--vl-num-layers", 0, "blocks of the head's VL self-attention"),
     ("--width", 8, "width of language model and head"),
     ("--num-layers", 1, "blocks of the head"),
+    ("--shift", 0, "pixels by which frames are shifted at random, at most"),
 )
 
 # Flag, its smallest value, what it is below, and what it is.
@@ -85,6 +86,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     arguments.add_out(parser, None, "directory of the run")
     arguments.add_num_threads(parser, "threads of torch", 1)
+    parser.add_argument(
+        "--device", default="cpu", help="torch's name of the device, such as cuda (default: cpu)"
+    )
     for flag, smallest, what in INTEGERS:
         arguments.add_integer(parser, flag, minimum=smallest, help=f"{what} ({default_of(flag)})")
     for flag, lowest, limit, what in NUMBERS:
@@ -132,6 +136,11 @@ def run(args: argparse.Namespace) -> int:
     writable_directory(args.out)
     torch.set_num_threads(args.num_threads)
     try:
+        torch.empty(0, device=args.device)
+    except (RuntimeError, AssertionError) as error:  # AssertionError: torch is built without CUDA
+        reason = str(error).splitlines()[0]
+        raise arguments.UsageError(f"--device: torch cannot use {args.device!r}: {reason}") from None
+    try:
         with output.progress_bar("reading", settings.steps) as update:
 
             def on_step(now: Progress) -> None:
@@ -141,9 +150,11 @@ def run(args: argparse.Namespace) -> int:
             if on_libero:
                 from saccade_lab.libero.training import train as train_on_libero
 
-                train_on_libero(args.demos, args.out, settings, on_step)
+                train_on_libero(args.demos, args.out, settings, on_step, device=args.device)
             else:
-                train.train(args.demos, args.out, settings, on_step, start=args.start_from)
+                train.train(
+                    args.demos, args.out, settings, on_step, start=args.start_from, device=args.device
+                )
     except KeyboardInterrupt:
         print(f"stopped; the same command continues from {args.out / train.STATE_FILE}")
         return EXIT_INTERRUPTED

@@ -15,7 +15,12 @@ from saccade_lab.training.train import Progress, fit, new_run
 
 
 def train(
-    demonstrations: Path, out: Path, settings: TrainingSettings, on_step: Callable[[Progress], None]
+    demonstrations: Path,
+    out: Path,
+    settings: TrainingSettings,
+    on_step: Callable[[Progress], None],
+    *,
+    device: str = "cpu",
 ) -> LiberoConfig:
     """Trains a policy from random weights, or continues the run in ``out``.
 
@@ -24,6 +29,7 @@ def train(
         out: Directory of the run.
         settings: Settings of the run.
         on_step: Called after each step.
+        device: As in ``saccade_lab.training.train.train``.
 
     Returns:
         The config of the policy.
@@ -38,6 +44,6 @@ def train(
     training, validation = load_samples(demonstrations, recordings, settings.horizon, config.processor())
     valid = training.mask[..., 0] > 0
     config = replace(config, statistics=recorded_statistics(training.state, training.actions[valid]))
-    run = new_run(settings, config, describe(demonstrations, recordings))
+    run = new_run(settings, config, describe(demonstrations, recordings), device)
     fit(run, training, validation, out, on_step)
     return config

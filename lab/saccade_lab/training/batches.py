@@ -13,7 +13,8 @@ from saccade.backbone.inputs import BackboneInputs
 from saccade.processor import Processor
 from saccade_lab.reference.backbone import BackboneFeatures
 from saccade_lab.training.dataset import Samples, normalized_actions
-from saccade_lab.training.frozen import FrozenFeatures, backbone_inputs
+from saccade_lab.training.frames import backbone_inputs, shifted
+from saccade_lab.training.frozen import FrozenFeatures
 from saccade_lab.training.learner import Batch
 from saccade_lab.training.policy_files import PolicyFiles
 
@@ -27,7 +28,7 @@ class Batches:
         prompts: What ``prompts_of`` returns.
         targets: Mean and standard deviation of the positions, ``(6,)`` each.
         batch_size: Frames per batch.
-        absent_share, language_dropout: See ``TrainingSettings``.
+        absent_share, language_dropout, shift: See ``TrainingSettings``.
         frozen: The features of the samples' frames, if the backbone is not trained.
         with_later: Whether batches contain the observations after the chunk was executed.
     """
@@ -42,6 +43,7 @@ class Batches:
         *,
         absent_share: float = 0.0,
         language_dropout: float = 0.0,
+        shift: int = 0,
         frozen: FrozenFeatures | None = None,
         with_later: bool = False,
     ) -> None:
@@ -49,7 +51,8 @@ class Batches:
         self._frozen = frozen
         self._with_later = with_later
         self._batch_size = batch_size
-        self._absent_share, self._language_dropout = absent_share, language_dropout
+        self._absent_share, self._language_dropout, self._shift = absent_share, language_dropout, shift
+        self._version = config.backbone_sizes.version
         normalizer = config.normalizer
         self._state = np.asarray(normalizer.state(samples.state))
         self._actions = normalized_actions(normalizer, samples.actions) * samples.mask
@@ -77,20 +80,26 @@ class Batches:
             for row in np.flatnonzero((rng.random(len(rows)) < self._language_dropout) & ~is_absent):
                 prompts[row] = self._prompts[-1][0]
         return Batch(
-            inputs=self._inputs(self._samples.now[rows], prompts),
+            inputs=self._inputs(self._samples.now[rows], prompts, rng),
             state=torch.from_numpy(self._state[rows]),
             actions=torch.from_numpy(actions),
             mask=torch.from_numpy(mask),
             targets=torch.from_numpy(self._targets[rows]),
-            later=self._inputs(later, prompts) if self._with_later else None,
+            later=self._inputs(later, prompts, rng) if self._with_later else None,
         )
 
     def _inputs(
-        self, frames: npt.NDArray[np.int64], prompts: list[npt.NDArray[np.int64]]
+        self,
+        frames: npt.NDArray[np.int64],
+        prompts: list[npt.NDArray[np.int64]],
+        rng: np.random.Generator,
     ) -> BackboneInputs | BackboneFeatures:
         if self._frozen is not None:
             return self._frozen(frames)
-        return backbone_inputs(self._samples.images[frames], prompts)
+        images = self._samples.images[frames]
+        if self._shift:
+            images = shifted(images, self._shift, rng)
+        return backbone_inputs(images, prompts, self._version)
 
 
 def prompts_of(config: PolicyFiles, processor: Processor) -> list[list[npt.NDArray[np.int64]]]:

@@ -20,10 +20,9 @@ from saccade.processor import Processor
 from saccade.robots import Normalizer
 from saccade_lab.sim import demos
 from saccade_lab.sim.tasks import TASKS
+from saccade_lab.training.frames import prepared
 
 VALIDATION_EVERY = 20  # every 20th demonstration of a task is held out
-PIXEL_CENTRE = np.float32(127.5)  # pixels are scaled as (u8 - 127.5) / 127.5
-N17_REPEATS = 2  # of a frame in the patches of N1.7's tower, which is made for videos
 MIN_VALID_ACTIONS = 4  # a frame with fewer usable actions is left out
 
 
@@ -32,7 +31,7 @@ class Samples:
     """Observations with their chunks. Only the frames are prepared; nothing else is normalised.
 
     Attributes:
-        images: ``(frames, cameras, ...)`` uint8, see ``prepared``: every recorded frame once, including
+        images: ``(frames, cameras, 3, H, W)`` uint8, see ``prepared``: every recorded frame once, including
             those that are only the later frame of a sample.
         now: ``(samples,)`` the index in ``images`` of the observation.
         later: ``(samples,)`` the index of the observation after the chunk was executed, see ``later_frames``.
@@ -84,25 +83,6 @@ def later_frames(demonstration: demos.Demonstration, horizon: int) -> npt.NDArra
     """
     steps = demonstration.frame_steps
     return np.minimum(np.searchsorted(steps, steps + horizon), len(steps) - 1)
-
-
-def prepared(images: npt.NDArray[np.uint8], processor: Processor) -> npt.NDArray[np.uint8]:
-    """Frames as the vision tower sees them, before they are scaled to [-1, 1].
-
-    Args:
-        images: ``(frames, cameras, H, W, 3)``.
-        processor: Processor of the policy.
-
-    Returns:
-        N1.5: ``(frames, cameras, 3, image_size, image_size)``. N1.7: ``(frames, cameras, patches, 768)``,
-        each patch once.
-    """
-    views = np.stack([processor.frame(image) for image in images.reshape(-1, *images.shape[2:])])
-    if processor.version == "n1.7":  # (views, patches, 3 * 2 * 256): the tower sees every frame twice
-        repeated = views.reshape(*views.shape[:2], 3, N17_REPEATS, -1)
-        views = repeated[:, :, :, 0].reshape(*views.shape[:2], -1)
-    pixels = np.rint(views * PIXEL_CENTRE + PIXEL_CENTRE)
-    return np.asarray(pixels.reshape(*images.shape[:2], *pixels.shape[1:]), dtype=np.uint8)
 
 
 def load_samples(

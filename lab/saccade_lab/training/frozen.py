@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -13,57 +12,13 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from saccade._internal.arrays import Float32Array
 from saccade._internal.files import write_atomically
 from saccade.backbone.inputs import BackboneInputs
 from saccade_lab.reference.backbone import Backbone, BackboneFeatures
-from saccade_lab.training.dataset import N17_REPEATS, PIXEL_CENTRE, Samples
+from saccade_lab.training.dataset import Samples
+from saccade_lab.training.frames import backbone_inputs, padded
 
 FRAMES_AT_ONCE = 64
-
-
-def padded(
-    prompts: Sequence[npt.NDArray[np.int64]], length: int = 0
-) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.bool_]]:
-    """Prompts padded on the left, as the released processors do, and which tokens are not padding.
-
-    Args:
-        prompts: The token ids of each.
-        length: Tokens to pad to at least. Default: those of the longest prompt.
-
-    Returns:
-        ``(B, T)`` each.
-
-    Example:
-        >>> ids, mask = padded([np.array([5, 6]), np.array([7])])
-        >>> ids.tolist(), mask.tolist()
-        ([[5, 6], [0, 7]], [[True, True], [False, True]])
-    """
-    length = max(length, *map(len, prompts))
-    ids, mask = np.zeros((len(prompts), length), np.int64), np.zeros((len(prompts), length), np.bool_)
-    for row, prompt in enumerate(prompts):
-        ids[row, length - len(prompt) :], mask[row, length - len(prompt) :] = prompt, True
-    return ids, mask
-
-
-def backbone_inputs(
-    images: npt.NDArray[np.uint8], prompts: Sequence[npt.NDArray[np.int64]], length: int = 0
-) -> BackboneInputs:
-    """What a backbone takes.
-
-    Args:
-        images: Frames as ``prepared`` returns them, ``(B, cameras, ...)``. N1.7's are square.
-        prompts, length: See ``padded``.
-    """
-    pixels: Float32Array = (images.astype(np.float32) - PIXEL_CENTRE) / PIXEL_CENTRE
-    ids, mask = padded(prompts, length)
-    if images.ndim == 5:  # (B, cameras, 3, H, W)
-        return BackboneInputs(pixels.reshape(-1, *pixels.shape[2:]), ids, mask)
-    patches, values = images.shape[2:]
-    side = math.isqrt(patches)
-    twice = np.repeat(pixels.reshape(-1, 3, 1, values // 3), N17_REPEATS, axis=2)
-    grid = np.tile(np.array([1, side, side]), (images.shape[0] * images.shape[1], 1))
-    return BackboneInputs(twice.reshape(-1, N17_REPEATS * values), ids, mask, grid)
 
 
 class FrozenFeatures:
@@ -105,12 +60,12 @@ class FrozenFeatures:
             array = np.lib.format.open_memmap(temporary, "w+", np.float16, shape)
             for first in range(0, len(array), FRAMES_AT_ONCE):
                 frames = np.arange(first, min(first + FRAMES_AT_ONCE, len(array)))
-                array[frames] = self._backbone(self._inputs(frames)).backbone_features.numpy()
+                array[frames] = self._backbone(self._inputs(frames)).backbone_features.cpu().numpy()
             array.flush()
 
     def _inputs(self, frames: npt.NDArray[np.int64]) -> BackboneInputs:
         prompts = [self._prompts[frame] for frame in frames]
-        return backbone_inputs(self._images[frames], prompts, self._length)
+        return backbone_inputs(self._images[frames], prompts, self._backbone.sizes.version, self._length)
 
     def __call__(self, frames: npt.NDArray[np.int64]) -> BackboneFeatures:
         """The features of some frames, as the backbone itself returns them."""

@@ -110,7 +110,7 @@ class Learner(nn.Module):
         seen = self.seen(batch.inputs)
         features = seen.backbone_features  # (B, S, width)
         if self.only == "backbone":
-            return {"loss": F.mse_loss(self.target_head(seen), batch.targets)}
+            return {"loss": F.mse_loss(self.target_head(seen), batch.targets.to(features))}
         noise = torch.randn(batch.actions.shape, generator=generator)
         time = self.action_head.sample_time(len(noise), generator)
         with self.watched_rows() as rows:
@@ -127,7 +127,7 @@ class Learner(nn.Module):
             )
         losses = {"loss": flow}
         if not self.only:
-            losses["target_loss"] = F.mse_loss(self.target_head(features[:, -1]), batch.targets)
+            losses["target_loss"] = F.mse_loss(self.target_head(features[:, -1]), batch.targets.to(features))
         if batch.later is not None:
             config = self.action_head.config
             first = config.num_state_rows

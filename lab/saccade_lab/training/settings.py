@@ -26,7 +26,7 @@ def features_name(start_sha256: str, recording_sha256: str, samples: str) -> str
 CATEGORY_STD = 0.02  # of the released code: `saccade_lab.reference.layers.TABLE_STD`, which needs torch
 RELEASED_WIDTH = 1536  # of GR00T N1.5
 #: Settings that were added after the first runs; see ``TrainingSettings.to_dict``.
-ADDED = ("category_std", "language_dropout", "version", "view_size")
+ADDED = ("category_std", "language_dropout", "shift", "version", "view_size")
 
 
 def released_std(width: int) -> float:
@@ -67,6 +67,9 @@ class TrainingSettings:
         language_dropout: Share of the other frames that get the released default for a missing instruction,
             as ``language_dropout_prob`` of Isaac-GR00T N1.5's training. Guidance needs a policy that knows
             it.
+        shift: Pixels by which each frame is shifted at random along each axis, at most, while the policy is
+            trained; edges are repeated. With few demonstrations it keeps a policy from learning the pixels
+            of each by heart.
         start_sha256: Hash of the tensors that the run starts from; empty for random ones. ``train`` sets it.
         seed: Seed of initial weights, order and noise.
         category_std: Standard deviation of the initial category-specific weights, those of the state encoder
@@ -99,6 +102,7 @@ class TrainingSettings:
     alignment_block: int | None = None
     absent_share: float = 0.1
     language_dropout: float = 0.0
+    shift: int = 0
     start_sha256: str = ""
     seed: int = 0
     category_std: float = CATEGORY_STD
@@ -126,12 +130,15 @@ class TrainingSettings:
         for name, share in (
             ("absent_share", self.absent_share),
             ("language_dropout", self.language_dropout),
+            ("shift", self.shift),
         ):
             if self.only == "head" and share:
                 raise InputError(
                     f"{name}: given {share}, expected 0 where only the head is trained: the features of a "
                     "frame are computed once, with an instruction of its own task"
                 )
+        if self.shift < 0:
+            raise InputError(f"shift: given {self.shift}, expected at least 0")
         for name, width in (("width", self.width), ("language_width", self.language_width)):
             if width % (2 * self.num_heads):
                 raise InputError(

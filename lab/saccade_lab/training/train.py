@@ -1,4 +1,4 @@
-"""Training the policy on demonstrations: flow matching on action chunks, in torch, on the CPU.
+"""Training the policy on demonstrations: flow matching on action chunks, in torch.
 
 A run is a directory with ``training.pt`` (all that is needed to continue), the policy so far
 (``config.json``, ``model.safetensors``, ``tokenizer.json``, ``experiment_cfg/metadata.json``),
@@ -118,9 +118,11 @@ def with_statistics(config: PolicyConfig, samples: Samples) -> PolicyConfig:
     return replace(config, statistics={kind: statistics_of(values) for kind, values in recorded.items()})
 
 
-def new_run(settings: TrainingSettings, config: PolicyFiles, demonstrations: dict[str, Any]) -> Run:
+def new_run(
+    settings: TrainingSettings, config: PolicyFiles, demonstrations: dict[str, Any], device: str = "cpu"
+) -> Run:
     """A run before its first step; for ``demonstrations`` see ``dataset.describe``."""
-    learner = new_learner(settings, config)
+    learner = new_learner(settings, config).to(device)
     matrices = [parameter for parameter in learner.parameters() if parameter.ndim >= 2]
     others = [parameter for parameter in learner.parameters() if parameter.ndim < 2]
     optimizer = torch.optim.AdamW(
@@ -181,7 +183,7 @@ def export(run: Run, out: Path) -> None:
 
     They are stored as bfloat16, which halves the size. The rounding is far below the noise of training.
     """
-    tensors = {name: tensor.to(torch.bfloat16).contiguous() for name, tensor in run.average.items()}
+    tensors = {name: tensor.cpu().to(torch.bfloat16).contiguous() for name, tensor in run.average.items()}
     with write_atomically(out / TENSOR_FILE) as temporary:
         temporary.write_bytes(serialize(tensors, metadata={"format": "pt"}))
     run.config.write(out)
@@ -220,7 +222,8 @@ def resume(run: Run, path: Path) -> None:
     Raises:
         InputError: It was started with other settings or other demonstrations.
     """
-    state = torch.load(path, weights_only=True)
+    device = next(run.learner.parameters()).device
+    state = torch.load(path, weights_only=True, map_location=device)
     settings = run.settings.to_dict()
     if state["settings"] != settings:
         other = ", ".join(changed(state["settings"], settings))
@@ -277,6 +280,7 @@ def train(
     on_step: Callable[[Progress], None],
     *,
     start: Path | None = None,
+    device: str = "cpu",
 ) -> PolicyConfig:
     """Trains a policy, or continues the run in ``out``. With glibc, the process then keeps freed memory.
 
@@ -287,6 +291,8 @@ def train(
         on_step: Called after each step.
         start: A policy to start from; None for random weights. Where only the head is trained, the features
             of its backbone are kept in files next to ``out``, for other runs.
+        device: Torch's name of the device to train on. A seed draws the same samples and noise on each; sums
+            are rounded in other ways.
 
     Returns:
         The config of the policy.
@@ -317,7 +323,7 @@ def train(
     config = (
         with_statistics(config, training) if start is None else config_of_start(config, start, settings.only)
     )
-    run = new_run(settings, config, recorded)
+    run = new_run(settings, config, recorded, device)
     if start is not None:
         start_from(run, start)
     fit(run, training, validation, out, on_step, features if settings.only == "head" else None)
@@ -350,7 +356,7 @@ def fit(
     targets = (training.targets.mean(axis=0), training.targets.std(axis=0) + SMALLEST_DEVIATION)
     prompts = prompts_of(config, config.processor())
 
-    def batches_of(samples: Samples, name: str, size: int, **shares: float) -> Batches:
+    def batches_of(samples: Samples, name: str, size: int, **changes: Any) -> Batches:
         frozen = None
         if features is not None:
             frozen = FrozenFeatures(samples, prompts, run.learner.backbone, features[name])
@@ -360,13 +366,13 @@ def fit(
             prompts,
             targets,
             size,
-            **shares,
+            **changes,
             frozen=frozen,
             with_later=settings.aligned_block is not None,
         )
 
-    shares = {"absent_share": settings.absent_share, "language_dropout": settings.language_dropout}
-    batches = batches_of(training, TRAINING, settings.batch_size, **shares)
+    changes = {name: getattr(settings, name) for name in ("absent_share", "language_dropout", "shift")}
+    batches = batches_of(training, TRAINING, settings.batch_size, **changes)
     held_out = batches_of(validation, VALIDATION, VALIDATION_FRAMES)
     try:
         loop(run, batches, held_out, out, on_step)

@@ -31,7 +31,7 @@ from saccade_lab.libero.sizes import libero_config
 from saccade_lab.reference import ActionHead, Backbone
 from saccade_lab.sim import demos as sim_demos
 from saccade_lab.training.batches import Batches, prompts_of
-from saccade_lab.training.frozen import backbone_inputs
+from saccade_lab.training.frames import backbone_inputs
 from saccade_lab.training.settings import LIBERO_SETTINGS, released_std
 from saccade_lab.training.train import Progress, new_run
 from tests.helpers.libero_cases import SAID, SIZE, TINY, demonstration, tiny, write_recording
@@ -108,7 +108,7 @@ def test_training_sees_what_the_policy_sees(trained: Path, recording: Path) -> N
     for row, number in ((0, 0), (len(samples) - 1, 1)):
         assert samples.tasks[row] == number
         now = samples.now[row]
-        found = backbone_inputs(samples.images[now : now + 1], [prompts[number][0]])
+        found = backbone_inputs(samples.images[now : now + 1], [prompts[number][0]], files.version)
         seen = policy.processor(list(shown[now]), SAID[number])
         np.testing.assert_allclose(found.pixel_values, seen.pixel_values, atol=1e-6)
         np.testing.assert_array_equal(found.input_ids, seen.input_ids)
@@ -200,7 +200,7 @@ def test_a_padded_prompt_changes_nothing(version: str, recording: Path) -> None:
     def loss(chosen: list[int]) -> float:
         numbers = [rows.index(row) for row in chosen]
         seen = learner.backbone(
-            backbone_inputs(samples.images[samples.now[chosen]], [prompts[n][0] for n in numbers])
+            backbone_inputs(samples.images[samples.now[chosen]], [prompts[n][0] for n in numbers], version)
         )
         return float(
             head.loss(

@@ -133,6 +133,8 @@ class Backbone(nn.Module):
             raise InputError(
                 f"input_ids: expected 0 to {vocabulary - 1}, got {int(ids.min())} to {int(ids.max())}"
             )
+        device = next(self.parameters()).device
+        ids, mask = ids.to(device), mask.to(device)
         features = (self.eagle_model if self.sizes.version == "n1.5" else self.model)(inputs, ids, mask)
         if self.sizes.project_to_dim is not None:
             features = self.eagle_linear(features)
@@ -157,7 +159,7 @@ class Eagle(nn.Module):
         tokens = [self.image_tokens(views.to(weight)) for views in self.views(inputs)]
         x = with_image_tokens(decoder.embed_tokens(ids), ids == self.sizes.image_token, torch.cat(tokens))
         # Positions count padding.
-        positions = torch.arange(ids.shape[1]).expand(ids.shape)
+        positions = torch.arange(ids.shape[1], device=ids.device).expand(ids.shape)
         text = self.sizes.text
         angles = text_angles(positions, text.theta, text.head_dim // 2, weight.dtype)  # (B, T, head_dim / 2)
         return decoder(x, angles, mask)
@@ -208,7 +210,7 @@ class Qwen3VlModel(nn.Module):
         tokens, stacked = self.visual(patches.to(weight), grids)  # (N, width) each
         image_mask = ids == sizes.image_token
         x = with_image_tokens(decoder.embed_tokens(ids), image_mask, tokens)
-        positions = prompt_positions(ids, mask, grids, sizes)  # (3, B, T)
+        positions = prompt_positions(ids.cpu(), mask.cpu(), grids, sizes).to(ids.device)  # (3, B, T)
         text = sizes.text
         angles = interleaved_angles(positions, text.theta, text.head_dim // 2, text.sections, weight.dtype)
         return decoder(x, angles, mask, added_after(stacked, image_mask))

@@ -43,8 +43,12 @@ class SelfAttention(nn.Module):
         """``x (P, vision_width)``, ``angles (P, head_dim / 2)``, the patches of each view; to its shape."""
         q, k, v = (split_heads(part, self.head_dim) for part in self.qkv(x).chunk(3, dim=-1))
         q, k = rotate(q, angles), rotate(k, angles)  # (heads, P, head_dim)
-        views = zip(q.split(lengths, 1), k.split(lengths, 1), v.split(lengths, 1), strict=True)
-        return self.proj(torch.cat([attend(*view) for view in views]))
+        if len(set(lengths)) == 1:  # together: a batch of training has many views of one size
+            sides = (-1, lengths[0])
+            views = attend(*(part.unflatten(1, sides).transpose(0, 1) for part in (q, k, v)))
+            return self.proj(views.flatten(0, 1))
+        separate = zip(q.split(lengths, 1), k.split(lengths, 1), v.split(lengths, 1), strict=True)
+        return self.proj(torch.cat([attend(*view) for view in separate]))
 
 
 class Mlp(nn.Module):
@@ -123,12 +127,10 @@ class VisionTower(nn.Module):
         Returns:
             The image tokens ``(N, width)``, and as many again for each deepstack layer.
         """
-        places = [patch_places(rows, columns, self.merge) for rows, columns in grids]
-        x = self.patch_embed(patches)
-        x = x + torch.cat(
-            [self.positions(*grid, *place) for grid, place in zip(grids, places, strict=True)]
-        )  # (P, vision_width)
-        rows, columns = (torch.cat(axis) for axis in zip(*places, strict=True))  # (P,) each
+        places = {grid: patch_places(*grid, self.merge, patches.device) for grid in set(grids)}
+        tables = {grid: self.positions(*grid, *place) for grid, place in places.items()}
+        x = self.patch_embed(patches) + torch.cat([tables[grid] for grid in grids])  # (P, vision_width)
+        rows, columns = (torch.cat([places[grid][axis] for grid in grids]) for axis in (0, 1))  # (P,) each
         angles = grid_angles(rows, columns, self.head_dim // 2, x.dtype)  # (P, head_dim / 2)
         lengths = [rows * columns for rows, columns in grids]
         stacked = []
@@ -150,8 +152,8 @@ class VisionTower(nn.Module):
         """
         table = self.pos_embed.weight
         side = round(table.shape[0] ** 0.5)
-        y = torch.linspace(0, side - 1, num_rows, dtype=table.dtype)[rows]
-        x = torch.linspace(0, side - 1, num_columns, dtype=table.dtype)[columns]
+        y = torch.linspace(0, side - 1, num_rows, dtype=table.dtype, device=table.device)[rows]
+        x = torch.linspace(0, side - 1, num_columns, dtype=table.dtype, device=table.device)[columns]
         top, left = y.long(), x.long()
         down, right = (y - top)[:, None], (x - left)[:, None]  # shares of the next entries, (patches, 1)
         bottom, next_column = (top + 1).clamp(max=side - 1), (left + 1).clamp(max=side - 1)
@@ -160,10 +162,10 @@ class VisionTower(nn.Module):
         return above * (1 - down) + below * down
 
 
-def patch_places(rows: int, columns: int, merge: int) -> tuple[Tensor, Tensor]:
+def patch_places(rows: int, columns: int, merge: int, device: torch.device) -> tuple[Tensor, Tensor]:
     """Row and column of each patch of a view, square after square as in the inputs, ``(patches,)``."""
-    row = torch.arange(rows)[:, None].expand(rows, columns)
-    column = torch.arange(columns).expand(rows, columns)
+    row = torch.arange(rows, device=device)[:, None].expand(rows, columns)
+    column = torch.arange(columns, device=device).expand(rows, columns)
 
     def by_square(x: Tensor) -> Tensor:
         return x.unflatten(1, (-1, merge)).unflatten(0, (-1, merge)).transpose(1, 2).flatten()
@@ -180,8 +182,8 @@ def prompt_positions(
     (p, p + r, p + c), and the next number is p plus the longer side of its grid. Padding has 1.
 
     Args:
-        input_ids: ``(B, T)``.
-        attention_mask: Bool ``(B, T)``.
+        input_ids: ``(B, T)``, on the CPU.
+        attention_mask: Bool ``(B, T)``, on the CPU.
         grids: Rows and columns of patches of each view, those of the first prompt first.
         sizes: Of the backbone.
 

@@ -26,7 +26,7 @@ def frequencies(theta: float, half: int, dtype: torch.dtype) -> Tensor:
 
 def text_angles(positions: Tensor, theta: float, half: int, dtype: torch.dtype) -> Tensor:
     """Angles of positions on one axis, ``(...)`` to ``(..., half)``."""
-    inverse = frequencies(theta, half, dtype)
+    inverse = frequencies(theta, half, dtype).to(positions.device)
     return positions[..., None].to(inverse.dtype) * inverse
 
 
@@ -49,7 +49,7 @@ def interleaved_angles(
         ``(..., half)``.
     """
     angles = text_angles(positions, theta, half, dtype)  # (3, ..., half)
-    k = torch.arange(half)
+    k = torch.arange(half, device=angles.device)
     mixed = angles[0]
     for axis in (1, 2):
         uses = (k % 3 == axis) & (k < 3 * sections[axis])  # (half,)

@@ -1,0 +1,123 @@
+"""Frames and prompts as training keeps and feeds them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import numpy.typing as npt
+
+from saccade._internal.arrays import Float32Array
+from saccade.backbone.inputs import BackboneInputs
+from saccade.processor import Processor
+
+PIXEL_CENTRE = np.float32(127.5)  # pixels are scaled as (u8 - 127.5) / 127.5
+# Of N1.7's tower, which is made for videos.
+N17_REPEATS = 2  # of a frame in its patches
+N17_PATCH, N17_MERGE = 16, 2  # pixels along a patch, patches along a square; as published
+
+
+def prepared(images: npt.NDArray[np.uint8], processor: Processor) -> npt.NDArray[np.uint8]:
+    """Frames as the vision tower sees them, before they are scaled to [-1, 1].
+
+    Args:
+        images: ``(frames, cameras, H, W, 3)``, square.
+        processor: Processor of the policy.
+
+    Returns:
+        ``(frames, cameras, 3, image_size, image_size)``.
+    """
+    views = np.stack([processor.frame(image) for image in images.reshape(-1, *images.shape[2:])])
+    pixels = np.rint(views * PIXEL_CENTRE + PIXEL_CENTRE).astype(np.uint8)
+    if processor.version == "n1.7":
+        pixels = _joined(pixels)
+    return pixels.reshape(*images.shape[:2], *pixels.shape[1:])
+
+
+def shifted(images: npt.NDArray[np.uint8], largest: int, rng: np.random.Generator) -> npt.NDArray[np.uint8]:
+    """Frames shifted at random, each by its own whole numbers of pixels; edges are repeated.
+
+    Args:
+        images: ``(B, cameras, 3, H, W)``.
+        largest: Pixels by which a frame is shifted at most along each axis.
+        rng: Draws the shifts.
+    """
+    views = images.reshape(-1, *images.shape[2:])
+    moves = rng.integers(-largest, largest, endpoint=True, size=(len(views), 2))
+    height, width = views.shape[2:]
+    out = np.empty_like(views)
+    for view, (down, right) in enumerate(moves):
+        rows = np.clip(np.arange(height) + down, 0, height - 1)
+        columns = np.clip(np.arange(width) + right, 0, width - 1)
+        out[view] = views[view][:, rows[:, None], columns]
+    return out.reshape(images.shape)
+
+
+def padded(
+    prompts: Sequence[npt.NDArray[np.int64]], length: int = 0
+) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.bool_]]:
+    """Prompts padded on the left, as the released processors do, and which tokens are not padding.
+
+    Args:
+        prompts: The token ids of each.
+        length: Tokens to pad to at least. Default: those of the longest prompt.
+
+    Returns:
+        ``(B, T)`` each.
+
+    Example:
+        >>> ids, mask = padded([np.array([5, 6]), np.array([7])])
+        >>> ids.tolist(), mask.tolist()
+        ([[5, 6], [0, 7]], [[True, True], [False, True]])
+    """
+    length = max(length, *map(len, prompts))
+    ids, mask = np.zeros((len(prompts), length), np.int64), np.zeros((len(prompts), length), np.bool_)
+    for row, prompt in enumerate(prompts):
+        ids[row, length - len(prompt) :], mask[row, length - len(prompt) :] = prompt, True
+    return ids, mask
+
+
+def backbone_inputs(
+    images: npt.NDArray[np.uint8],
+    prompts: Sequence[npt.NDArray[np.int64]],
+    version: str,
+    length: int = 0,
+) -> BackboneInputs:
+    """What a backbone takes.
+
+    Args:
+        images: Frames as ``prepared`` returns them, ``(B, cameras, 3, H, W)``.
+        prompts, length: See ``padded``.
+        version: Release of the backbone.
+    """
+    ids, mask = padded(prompts, length)
+    views = images.reshape(-1, *images.shape[2:])
+    if version != "n1.7":
+        return BackboneInputs(_scaled(views), ids, mask)
+    rows, columns = (side // N17_PATCH for side in views.shape[2:])
+    grid = np.tile(np.array([1, rows, columns]), (len(views), 1))
+    return BackboneInputs(_scaled(_patches(views)), ids, mask, grid)
+
+
+def _scaled(pixels: npt.NDArray[np.uint8]) -> Float32Array:
+    return (pixels.astype(np.float32) - PIXEL_CENTRE) / PIXEL_CENTRE
+
+
+def _patches(views: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
+    """``(V, 3, H, W)`` to N1.7's patches, ``(V * patches, 3 * repeats * patch**2)``, square after square."""
+    count, channels, height, width = views.shape
+    side = N17_PATCH * N17_MERGE
+    squares = views.reshape(
+        count, channels, height // side, N17_MERGE, N17_PATCH, width // side, N17_MERGE, N17_PATCH
+    ).transpose(0, 2, 5, 3, 6, 1, 4, 7)  # (V, squares down, right, patches down, right, 3, y, x)
+    patches = squares.reshape(-1, channels, 1, N17_PATCH**2)
+    return np.repeat(patches, N17_REPEATS, axis=2).reshape(len(patches), -1)
+
+
+def _joined(patches: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
+    """The inverse of ``_patches`` for square views, ``(V, patches, values)`` to ``(V, 3, H, W)``."""
+    side = round(patches.shape[1] ** 0.5) // N17_MERGE  # squares along a view
+    once = patches.reshape(*patches.shape[:2], 3, N17_REPEATS, -1)[:, :, :, 0]
+    squares = once.reshape(-1, side, side, N17_MERGE, N17_MERGE, 3, N17_PATCH, N17_PATCH)
+    pixels = side * N17_MERGE * N17_PATCH
+    return squares.transpose(0, 5, 1, 3, 6, 2, 4, 7).reshape(-1, 3, pixels, pixels)
