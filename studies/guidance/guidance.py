@@ -15,7 +15,7 @@ import functools
 import shutil
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -40,13 +40,12 @@ from saccade_lab.study.table import read_table, table_path
 from saccade_lab.training.settings import TrainingSettings
 
 TASKS = ("touch-yellow", "touch-blue")
-RECORDED, CHOSEN = 400, 200  # demonstrations of each task
-#: By recording, how many of a task's chosen demonstrations have the named ball on the right.
-ON_THE_RIGHT = {"confounded": 180, "balanced": 100}
+RECORDED, CHOSEN = 400, 200  # demonstrations of each task: all of them, and of the confounded recording
+ON_THE_RIGHT = 180  # of a task's confounded demonstrations have the named ball on the right
 
-SMALL = TrainingSettings(
-    steps=3200, width=64, learning_rate=2e-3, ema_decay=0.995, num_future_tokens=8, absent_share=0.0
-)
+#: Trained from random weights, and from the weights of a policy that follows instructions.
+FROM_RANDOM = TrainingSettings(steps=16_000, absent_share=0.0)
+TUNED = TrainingSettings(steps=4000, learning_rate=3e-4, absent_share=0.0)
 EPISODES = 300  # of each task; the named ball is on the right in one of the two tasks of a seed
 BLOCK = 10  # seeds of a cell
 WEIGHTS = (0.0, 1.5, 2.0, 3.0, 5.0)
@@ -67,25 +66,39 @@ COLUMNS = (
 
 @dataclass(frozen=True)
 class Trained:
-    """A policy of the plan: its recording, the share of dropped instructions, and the training seed."""
+    """A policy of the plan.
 
-    recording: str
+    Attributes:
+        kind: One of ``KINDS``.
+        language_dropout: The share of dropped instructions.
+        seed: Of the training.
+    """
+
+    kind: str
     language_dropout: float
     seed: int
 
     @property
     def name(self) -> str:
         """Its name, and that of its folder."""
-        return f"{self.recording}-dropout-{round(100 * self.language_dropout)}-seed-{self.seed}"
+        return f"{self.kind}-dropout-{round(100 * self.language_dropout)}-seed-{self.seed}"
+
+    @property
+    def recording(self) -> str:
+        """The folder of its demonstrations."""
+        return "all" if self.kind == "balanced" else "confounded"
 
 
+KINDS = ("balanced", "tuned", "confounded")
+SHARES = (0.0, 0.1)
+START = Trained("balanced", 0.0, 0)  # of those that are tuned
 POLICIES = (
-    Trained("confounded", 0.0, 0),
-    Trained("confounded", 0.1, 0),
-    Trained("balanced", 0.0, 0),
-    *(Trained("confounded", share, seed) for seed in (1, 2) for share in (0.0, 0.1)),
+    START,
+    *(Trained("tuned", share, 0) for share in SHARES),
+    *(Trained("confounded", share, 0) for share in SHARES),
+    *(Trained("tuned", share, seed) for seed in (1, 2) for share in SHARES),
 )
-TESTED = tuple(one.name for one in POLICIES if (one.recording, one.seed) == ("confounded", 0))
+TESTED = tuple(one.name for one in POLICIES if (one.kind, one.seed) == ("tuned", 0))
 #: Weight and ``without`` of every arm, the unchanged policy and those of the tests first.
 ARMS: tuple[tuple[float, str | None], ...] = (
     (1.0, None),
@@ -100,12 +113,11 @@ def record(out: Path, args: argparse.Namespace) -> None:
     everything = out / "demos" / "all"
     counts = dict.fromkeys(TASKS, RECORDED)
     demos.record_tasks(counts, everything, demos.RecordingSettings(), lambda task: None, workers_of(args))
-    for recording, count in ON_THE_RIGHT.items():
-        for task in TASKS:
-            chosen = out / "demos" / recording / task
-            chosen.mkdir(parents=True, exist_ok=True)
-            for path in (*choose(everything, task, count), everything / task / "recording.json"):
-                shutil.copyfile(path, chosen / path.name)
+    for task in TASKS:
+        chosen = out / "demos" / "confounded" / task
+        chosen.mkdir(parents=True, exist_ok=True)
+        for path in (*choose(everything, task, ON_THE_RIGHT), everything / task / "recording.json"):
+            shutil.copyfile(path, chosen / path.name)
 
 
 def choose(recorded: Path, task: str, on_the_right: int) -> list[Path]:
@@ -127,7 +139,7 @@ def choose(recorded: Path, task: str, on_the_right: int) -> list[Path]:
     return found
 
 
-def train_all(out: Path, names: Sequence[str]) -> None:
+def train_all(out: Path, names: Sequence[str], device: str) -> None:
     """Trains the policies of these names, or all, in the order of the plan."""
     import torch
 
@@ -137,12 +149,20 @@ def train_all(out: Path, names: Sequence[str]) -> None:
     for policy in POLICIES:
         if names and policy.name not in names:
             continue
-        settings = TrainingSettings(
-            **{**vars(SMALL), "seed": policy.seed, "language_dropout": policy.language_dropout}
+        is_tuned = policy.kind == "tuned"
+        settings = replace(
+            TUNED if is_tuned else FROM_RANDOM, seed=policy.seed, language_dropout=policy.language_dropout
         )
-        start = time.monotonic()
-        train(out / "demos" / policy.recording, out / policy.name, settings, lambda progress: None)
-        print(f"{policy.name}: {time.monotonic() - start:.0f} s", flush=True)
+        began = time.monotonic()
+        train(
+            out / "demos" / policy.recording,
+            out / policy.name,
+            settings,
+            lambda progress: None,
+            start=out / START.name if is_tuned else None,
+            device=device,
+        )
+        print(f"{policy.name}: {time.monotonic() - began:.0f} s", flush=True)
 
 
 class Guided(Policy):
@@ -267,12 +287,13 @@ def main() -> None:
     parser.add_argument("part", choices=("demos", "train", "judge", "report"))
     parser.add_argument("--out", type=Path, default=Path("out/guidance"))
     parser.add_argument("--policies", nargs="*", default=[], help="train only these")
+    parser.add_argument("--device", default="cpu", help="torch's name of the device to train on")
     add_worker_arguments(parser, "episodes")
     args = parser.parse_args()
     if args.part == "demos":
         record(args.out, args)
     elif args.part == "train":
-        train_all(args.out, args.policies)
+        train_all(args.out, args.policies, args.device)
     elif args.part == "judge":
         judge(args.out, args)
     else:
