@@ -31,7 +31,7 @@ def prepared(images: npt.NDArray[np.uint8], processor: Processor) -> npt.NDArray
     pixels = np.rint(views * PIXEL_CENTRE + PIXEL_CENTRE).astype(np.uint8)
     if processor.version == "n1.7":
         pixels = _joined(pixels)
-    return pixels.reshape(*images.shape[:2], *pixels.shape[1:])
+    return np.asarray(pixels.reshape(*images.shape[:2], *pixels.shape[1:]), np.uint8)
 
 
 def shifted(images: npt.NDArray[np.uint8], largest: int, rng: np.random.Generator) -> npt.NDArray[np.uint8]:

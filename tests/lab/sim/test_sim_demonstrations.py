@@ -14,7 +14,8 @@ from saccade.processor import Processor
 from saccade_lab.sim import demos
 from saccade_lab.sim.tasks import DEMONSTRATION_SEEDS
 from saccade_lab.training import train
-from saccade_lab.training.dataset import chunks, describe, later_frames, load_samples, prepared
+from saccade_lab.training.dataset import chunks, describe, later_frames, load_samples
+from saccade_lab.training.frames import prepared
 from saccade_lab.training.settings import TrainingSettings
 from tests.helpers.training_cases import RECORDING, TASKS, TINY, recorded
 
