@@ -218,7 +218,7 @@ sys.exit(main(sys.argv[1:]))
 @pytest.mark.parametrize("name", [*cli.NEEDS, *NEEDS])
 def test_all_that_is_missing_is_named_with_one_command(name: str, tmp_path: Path) -> None:
     arguments = {
-        "act": ["checkpoint"],
+        "act --image": ["front.png", "--", "checkpoint"],
         "attention --frames": ["frames"],
         "certify": ["certificate.json"],
         "demos": ["--out", "out"],

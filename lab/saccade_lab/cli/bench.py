@@ -31,7 +31,7 @@ from saccade_lab.random_checkpoint import head as random_head
 from saccade_lab.timing import Call, Counter, Machine, arithmetic_of, by_turns, profiled, quartiles, works_of
 
 EXTRAS = LAB
-HELP = "time the action head and compare it with the limits of this machine"
+HELP = "time the head beside the limits of this machine"
 EPILOG = """\
 The floor of a part is the longer of two times: its multiply-adds at the peak rate of their arithmetic, and
 reading its weights at the bandwidth of memory. Both peaks are measured in the same run.

@@ -32,7 +32,7 @@ FILES = ("data_config", "tokenizer")
 #: Protocols whose programs fail after the last official state; others begin again with the first one.
 END_WITH_STATES = ("isaac-n15",)
 
-HELP = "run a policy on LIBERO and report how often it succeeds, by a released protocol"
+HELP = "run a policy on LIBERO by a released protocol"
 EXTRAS = LAB
 
 EPILOG = """\

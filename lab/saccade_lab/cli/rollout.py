@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from saccade_lab.sim.policy import Policy
     from saccade_lab.sim.report import Summary
 
-HELP = "run a policy on the simulated robot and report how often it succeeds"
+HELP = "run a policy on the simulated robot, count successes"
 EXTRAS = LAB
 
 COLUMNS = 50  # of the contact sheet: with more seeds, only the first ones are shown

@@ -1,14 +1,21 @@
-"""The instruction set, threads and processor of this machine."""
+"""What saccade is and would use on this machine: its build, instruction set, threads, processor, packages."""
 
 from __future__ import annotations
 
+import importlib.metadata
+import os
 import platform
+import re
 from pathlib import Path
 from typing import Any, Literal, overload
 
 import numpy as np
 
 import saccade._saccade as _saccade
+from saccade._internal import extras
+
+#: Other packages that a bug report should name, besides those of the extras.
+OTHERS = ("saccade-vla-lab", "lerobot-policy-saccade", "lerobot", "transformers", "mujoco")
 
 
 @overload
@@ -16,8 +23,9 @@ def show_config(mode: Literal["stdout"] = "stdout") -> None: ...
 @overload
 def show_config(mode: Literal["dicts"]) -> dict[str, Any]: ...
 def show_config(mode: Literal["stdout", "dicts"] = "stdout") -> dict[str, Any] | None:
-    """Prints what a head that is loaded now would use on this machine.
+    """Prints what a head that is loaded now would use on this machine. ``saccade info`` prints the same.
 
+    - ``build``: how the library was compiled: profile, architecture, system, features.
     - ``isa``: the instruction set. The environment variable ``SACCADE_ISA`` selects one of
       ``available_isas``.
     - ``cpu``: the name of the processor, where the system reports one.
@@ -27,6 +35,10 @@ def show_config(mode: Literal["stdout", "dicts"] = "stdout") -> dict[str, Any] |
       instructions. A family that was not measured gets what the newest one of its vendor gets.
     - ``tiles``: whether AMX can be used; if not, why.
     - ``num_threads``: the default number of threads, which ``SACCADE_NUM_THREADS`` sets.
+    - ``processors``: the number of logical processors that this process may use, and ``quota`` how many of
+      them its control group grants at a time; None without a quota.
+    - ``caches``: of one processor, as Linux reports them: ``"L2 1024K"``. Empty elsewhere.
+    - ``packages``: the optional packages that are installed, with their versions.
 
     Args:
         mode: ``"stdout"`` prints, ``"dicts"`` returns a dict instead.
@@ -43,6 +55,7 @@ def show_config(mode: Literal["stdout", "dicts"] = "stdout") -> dict[str, Any] |
     family, rates, tiles = _saccade.cpu_report()
     config = {
         "saccade": _saccade.__version__,
+        "build": _saccade.build(),
         "cpu": cpu_name(),
         "isa": isa,
         "dot_products": _saccade.dot_products(),
@@ -51,15 +64,54 @@ def show_config(mode: Literal["stdout", "dicts"] = "stdout") -> dict[str, Any] |
         "rates": rates,
         "tiles": tiles,
         "num_threads": _saccade.default_num_threads(),
+        "processors": usable_processors(),
+        "quota": _saccade.cpu_quota(),
+        "caches": caches(Path("/sys/devices/system/cpu/cpu0/cache")),
         "numpy": np.__version__,
         "python": platform.python_version(),
+        "system": platform.platform(),
         "machine": platform.machine(),
+        "packages": packages(),
     }
     if mode == "dicts":
         return config
     for name, value in config.items():
-        print(f"{name}: {', '.join(value) or 'none' if isinstance(value, list) else value}")
+        shown = (", ".join(value) if isinstance(value, list) else value) or "none"
+        print(f"{name}: {shown}")
     return None
+
+
+def usable_processors() -> int:
+    """The number of logical processors that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def caches(folder: Path) -> list[str]:
+    """Level and size of each cache that holds data, from a folder as Linux has one for each processor."""
+    found = []
+    for cache in sorted(folder.glob("index*")):
+        try:
+            level, kind, size = ((cache / name).read_text().strip() for name in ("level", "type", "size"))
+        except OSError:
+            continue
+        if kind != "Instruction":
+            found.append(f"L{level} {size}")
+    return found
+
+
+def packages() -> list[str]:
+    """Name and version of each optional package that is installed, in the order of the extras."""
+    requirements = [line for modules in extras.SACCADE.modules.values() for line in modules.values()]
+    names = [re.split("[<>=]", line)[0] for line in requirements]
+    found = []
+    for name in (*names, *OTHERS):
+        try:
+            found.append(f"{name} {importlib.metadata.version(name)}")
+        except importlib.metadata.PackageNotFoundError:
+            continue
+    return found
 
 
 def cpu_name() -> str:

@@ -2,7 +2,7 @@
 
 `description` recognises layout and version, and `inspection` examines every tensor. `rewriting` quantises,
 converts and resizes. `precisions` compares the precisions of a whole checkpoint, and `comparison` the actions
-of a checkpoint and its resized copy.
+of a checkpoint and its resized copy. `verification` checks all of a checkpoint and runs it.
 """
 
 from pathlib import Path
@@ -21,6 +21,7 @@ from saccade.checkpoints.rewriting import (
     quantize,
     resize,
 )
+from saccade.checkpoints.verification import Verification, verify
 
 __all__ = [
     "ActionChanges",
@@ -30,6 +31,7 @@ __all__ = [
     "PrecisionCheck",
     "QuantizeReport",
     "ResizeReport",
+    "Verification",
     "Written",
     "action_changes",
     "check_precisions",
@@ -40,6 +42,7 @@ __all__ = [
     "quantize",
     "read_tensors",
     "resize",
+    "verify",
 ]
 
 

@@ -30,27 +30,38 @@ from saccade.errors import SaccadeError
 # A command is the module of its name in this package. Its line of help is repeated here, so that
 # `saccade --help` imports none of them; a test compares the two.
 COMMANDS: dict[str, str] = {
+    "demo": "run the bundled policy on recorded images: try this first",
+    "info": "say what a bug report needs: version, build, CPU, packages",
     "act": "run a whole checkpoint on images and an instruction",
-    "serve": "serve a whole checkpoint to robots and simulators over the network",
-    "evaluate": "compare a checkpoint's actions with recorded ones",
-    "certify": "check on this machine what `saccade evaluate --certify` recorded",
-    "diagnose": "say which inputs a checkpoint uses: instruction, cameras, state",
+    "serve": "serve a whole checkpoint to robots over the network",
     "inspect": "show what a checkpoint contains",
+    "verify": "check a checkpoint, run it, print a report to send",
+    "evaluate": "compare a checkpoint's actions with recorded ones",
+    "certify": "check here what `saccade evaluate --certify` recorded",
+    "diagnose": "say which inputs a checkpoint uses",
+    "convert": "write a checkpoint with other robots, dtype or files",
     "resize": "write a checkpoint with another number of future tokens",
-    "convert": "write a checkpoint with other embodiments, dtype or shards, or merge a LoRA adapter",
     "quantize": "write a checkpoint with int8 weights",
 }
 # The commands of saccade-vla-lab, found by its entry points. They are listed here, so that the help and the
 # message that says what to install need no other package.
 LAB_COMMANDS: dict[str, str] = {
-    "rollout": "run a policy on the simulated robot and report how often it succeeds",
+    "rollout": "run a policy on the simulated robot, count successes",
     "demos": "record demonstrations of the tasks with scripted experts",
     "train": "train a policy on recorded demonstrations",
     "attention": "show what the rows of the action head attend to",
     "study": "measure what the parts of an action head contribute",
     "parity": "compare the Rust head with the torch reference",
-    "libero": "run a policy on LIBERO and report how often it succeeds, by a released protocol",
-    "bench": "time the action head and compare it with the limits of this machine",
+    "libero": "run a policy on LIBERO by a released protocol",
+    "bench": "time the head beside the limits of this machine",
+}
+#: The headings of `saccade --help`, and the commands under each.
+GROUPS: dict[str, tuple[str, ...]] = {
+    "start": ("demo", "info"),
+    "run": ("act", "serve"),
+    "examine": ("inspect", "verify", "evaluate", "certify", "diagnose"),
+    "rewrite": ("convert", "resize", "quantize"),
+    "lab": tuple(LAB_COMMANDS),
 }
 #: The extra of the lab that a command needs; for the others `sim` is enough.
 LAB_EXTRAS = {"train": "study", "study": "study", "parity": "study", "libero": "libero"}
@@ -60,7 +71,7 @@ ENTRY_POINTS = "saccade.commands"
 # The optional packages that each command needs, checked once its arguments have been: a message then names
 # all that are missing. Commands without an entry need NumPy only.
 NEEDS: dict[str, tuple[str, ...]] = {
-    "act": ("rich", "PIL"),
+    "act --image": ("PIL",),
     "serve": ("zmq", "msgpack"),
     "evaluate": ("pyarrow", "av"),
     "certify": ("pyarrow", "av"),
@@ -78,17 +89,6 @@ EXIT_BAD_INPUT = 2
 EXIT_INTERRUPTED = 130  # 128 + SIGINT, as a shell reports it
 EXIT_BROKEN_PIPE = 141  # 128 + SIGPIPE
 EXIT_TERMINATED = 143  # 128 + SIGTERM
-
-
-EPILOG = """\
-Lists take commas, spaces or both: --tasks reach,push or --tasks reach push. Bad arguments, paths that cannot
-be used and missing packages give one line on standard error and exit status 2.
-
-examples:
-  saccade act --help
-  saccade inspect checkpoint/
-  saccade serve checkpoint/
-"""
 
 
 @runtime_checkable
@@ -125,6 +125,19 @@ class Parser(argparse.ArgumentParser):
         self.exit(EXIT_BAD_INPUT, f"{self.prog}: {message} (see {self.prog} --help)\n")
 
 
+class TopParser(Parser):
+    """The parser of the program itself, whose help fits a screen of 80 columns and 24 lines."""
+
+    def format_help(self) -> str:
+        """One line for each command, in groups."""
+        lines = ["usage: saccade COMMAND ...     or: saccade COMMAND --help, saccade --version", ""]
+        for group, names in GROUPS.items():
+            for index, name in enumerate(names):
+                heading = group if index == 0 else ""
+                lines.append(f"{heading:<8} {name:<10} {COMMANDS.get(name) or LAB_COMMANDS[name]}")
+        return "\n".join([*lines, ""])
+
+
 def load_command(name: str) -> Command:
     """The module of a command; a `UsageError` for one of the lab, if that is not installed."""
     if name in COMMANDS:
@@ -148,13 +161,9 @@ def load_command(name: str) -> Command:
 
 def build_parser(chosen: str | None = None) -> argparse.ArgumentParser:
     """The parser of the command line, with the arguments of the chosen command; no other is imported."""
-    parser = Parser(
-        prog="saccade",
-        description="Run GR00T-style robot policies on CPUs: act, serve, inspect and convert checkpoints.",
-        epilog=EPILOG,
-    )
+    parser = TopParser(prog="saccade")
     parser.add_argument("--version", action="version", version=f"saccade {__version__}")
-    commands = parser.add_subparsers(dest="command", metavar="command", title="commands", parser_class=Parser)
+    commands = parser.add_subparsers(dest="command", metavar="command", parser_class=Parser)
     for name, help_line in {**COMMANDS, **LAB_COMMANDS}.items():
         sub = commands.add_parser(
             name, help=help_line, description=help_line[0].upper() + help_line[1:] + "."

@@ -68,7 +68,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Loads the checkpoint, computes a chunk and prints it."""
-    require("act")
+    if args.image:
+        require("act --image")
     from saccade.observations.pictures import instruction_of, observation, read_state
     from saccade.policy.encoding import compute_features, encode_features
     from saccade.policy.policy import Policy

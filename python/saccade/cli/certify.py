@@ -10,7 +10,7 @@ from saccade._internal import flags as arguments
 from saccade.cli import EXIT_OK, output, require
 from saccade.cli.output import Section, show
 
-HELP = "check on this machine what `saccade evaluate --certify` recorded"
+HELP = "check here what `saccade evaluate --certify` recorded"
 EPILOG = """\
 Compares the hashes of checkpoint and recordings, computes the certified observations again, and compares the
 actions: bit for bit on the instruction set and version of the certificate, else within what rounding allows.

@@ -9,7 +9,7 @@ from saccade._internal import flags as arguments
 from saccade._internal.flags import UsageError
 from saccade.cli.copying import add_copy_arguments, copy, print_report
 
-HELP = "write a checkpoint with other embodiments, dtype or shards, or merge a LoRA adapter"
+HELP = "write a checkpoint with other robots, dtype or files"
 
 EPILOG = """\
 Everything else is copied bit for bit: tensors, config.json, and other files of the checkpoint such as

@@ -12,7 +12,7 @@ from saccade.cli.output import Section
 if TYPE_CHECKING:
     from saccade.diagnosis.report import Diagnosis
 
-HELP = "say which inputs a checkpoint uses: instruction, cameras, state"
+HELP = "say which inputs a checkpoint uses"
 EPILOG = """\
 Changes one input of recorded observations at a time, and measures what that does to the actions. Each input
 is used, barely used, ignored or undecided; docs/diagnose.md has the rules.

@@ -12,7 +12,7 @@ from saccade.cli import EXIT_INTERRUPTED, EXIT_OK, require
 from saccade.policy.guidance import Without
 from saccade.serve.limits import Limits
 
-HELP = "serve a whole checkpoint to robots and simulators over the network"
+HELP = "serve a whole checkpoint to robots over the network"
 
 #: The default of --api-token, so that the secret is not in the list of processes.
 TOKEN_VARIABLE = "SACCADE_API_TOKEN"

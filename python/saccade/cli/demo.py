@@ -1,0 +1,121 @@
+"""`saccade demo`: the bundled policy acts on recorded images, drawn in the terminal."""
+
+from __future__ import annotations
+
+import argparse
+import shutil
+import sys
+import time
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from saccade._internal.flags import UsageError
+from saccade.cli import EXIT_OK, drawing
+
+if TYPE_CHECKING:
+    from saccade._internal.arrays import Float32Array
+    from saccade.checkpoints.demo_frames import Moment
+    from saccade.policy.policy import Policy
+
+HELP = "run the bundled policy on recorded images: try this first"
+EPILOG = """\
+The policy is small (2 million parameters) and was trained on five simulated tasks, in the released models'
+structure. It is no released model. Images and state were recorded in simulation, and so was what the
+scripted expert did from there on. reach and push have the same scene: give one the other's words.
+
+examples:
+  saccade demo
+  saccade demo --task drawer-open
+  saccade demo --task push --instruction "reach the green ball"
+"""
+TASK = "push"
+#: What the numbers of an action are: velocities of the hand along three axes, and the gripper's effort.
+NUMBERS = ("hand x", "hand y", "hand z", "gripper")
+#: A view is drawn no wider than this.
+WIDEST = 40
+GAP = 2
+REPEATS = 5
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declares the command's arguments."""
+    parser.epilog = EPILOG
+    parser.add_argument("--task", default=TASK, metavar="NAME", help=f"recorded task (default: {TASK})")
+    parser.add_argument("--instruction", metavar="TEXT", help="other words than the recorded ones")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Acts, and draws images and actions."""
+    import saccade
+    from saccade.checkpoints.demo_frames import moments
+
+    recorded = moments()
+    if args.task not in recorded:
+        raise UsageError(f"--task: unknown name {args.task!r}, expected one of {', '.join(recorded)}")
+    moment = recorded[args.task]
+    started = time.perf_counter()
+    policy = saccade.Policy.from_pretrained(saccade.demo_checkpoint())
+    loaded = time.perf_counter() - started
+    observation = moment.observation(args.instruction)
+    seconds = []
+    for _ in range(1 + REPEATS):  # the first call also allocates its memory
+        started = time.perf_counter()
+        found = policy.act(observation, seed=0)
+        seconds.append(time.perf_counter() - started)
+    actions = np.concatenate([found["hand"][0], found["gripper"][0]], axis=-1)
+    expert = moment.actions if args.instruction in (None, moment.instruction) else None
+    print(f'{moment.task}: "{args.instruction or moment.instruction}"')
+    print("\n".join(views(moment)))
+    print("\n".join(chart(actions, expert)))
+    print(times(policy, loaded, float(np.median(seconds[1:]))))
+    print("Next: saccade act CHECKPOINT, saccade serve CHECKPOINT, saccade --help")
+    return EXIT_OK
+
+
+def views(moment: Moment) -> list[str]:
+    """The cameras' images side by side, as wide as the terminal allows, under their names."""
+    columns = shutil.get_terminal_size().columns
+    count = len(moment.images)
+    width = max(4, min(WIDEST, (columns - GAP * (count - 1)) // count))
+    colours = drawing.colours_of(sys.stdout)
+    names = [name.ljust(width) for name in moment.images]
+    gap = " " * GAP
+    pictures = [drawing.picture(image, width, colours) for image in moment.images.values()]
+    return [gap.join(names).rstrip(), *drawing.beside(pictures, gap)]
+
+
+def chart(actions: Float32Array, expert: Float32Array | None) -> list[str]:
+    """A line for each number of the actions ``(steps, 4)``: its course and some values, and the expert's.
+
+    ``expert`` is None if it was given other words than the policy.
+    """
+    steps = len(actions)
+    with_bars = drawing.can_write(sys.stdout, drawing.BARS)
+    shown = [0, steps // 3, 2 * steps // 3, steps - 1]
+    ends = [0, steps - 1]
+    head = "".join(f"{f'step {step}':>8}" for step in shown)
+    lines = [f"{f'{steps} actions, -1 to 1':<24}{head}{'' if expert is None else '  recorded expert'}"]
+    for number, name in enumerate(NUMBERS):
+        values = actions[:, number].tolist()
+        course = drawing.bars(values, -1.0, 1.0) if with_bars else ""
+        line = f"{name:<8}{course:<16}{values_at(values, shown)}"
+        if expert is not None:
+            other = expert[:, number].tolist()
+            line += "  " + (drawing.bars(other, -1.0, 1.0) if with_bars else values_at(other, ends))
+        lines.append(line)
+    return lines
+
+
+def values_at(values: Sequence[float], steps: Sequence[int]) -> str:
+    """Some of the values, each in eight columns."""
+    return "".join(f"{values[step]:8.2f}" for step in steps)
+
+
+def times(policy: Policy, loaded: float, chunk: float) -> str:
+    """How long loading and a chunk took, and on what."""
+    head = policy.head
+    threads = f"{head.num_threads} thread" + ("" if head.num_threads == 1 else "s")
+    took = f"Loaded in {1e3 * loaded:.0f} ms; {1e3 * chunk:.1f} ms from images to actions"
+    return f"{took} ({head.isa}, {threads})"
