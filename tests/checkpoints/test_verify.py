@@ -186,7 +186,7 @@ def test_actions_that_are_not_finite_fail(monkeypatch: pytest.MonkeyPatch) -> No
 def test_too_little_memory_for_one_precision_is_a_problem(monkeypatch: pytest.MonkeyPatch) -> None:
     load = saccade.Policy.from_pretrained.__func__  # type: ignore[attr-defined]
 
-    def small(cls: type, source: Any, **options: Any) -> Any:
+    def small(cls: Any, /, source: Any, **options: Any) -> Any:
         if options["precision"]["head"] == "bfloat16" == options["precision"]["backbone"]:
             raise MemoryError("Unable to allocate 48 GiB")
         return load(cls, source, **options)

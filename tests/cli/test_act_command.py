@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import time
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ import pytest
 from PIL import Image
 
 from saccade import Policy, cli
+from saccade.cli import profiling
 from tests.helpers.whole_checkpoints import EMBODIMENT, HEIGHT, WIDTH, whole
 
 PARTS = ["load", "frames", "processor", "backbone", "encode", "sample"]
@@ -123,3 +125,31 @@ def test_bad_input_is_one_line(
     assert status == 2
     assert message in error
     assert error.count("\n") == 1
+
+
+def test_a_profile_says_where_the_time_goes(capsys: pytest.CaptureFixture[str]) -> None:
+    found = act(whole("n17"), "--embodiment", "10", "--profile", capsys=capsys)
+    profile = found["profile"]
+    assert list(profile["milliseconds"]) == list(profiling.PARTS)
+    assert all(spent >= 0 for spent in profile["milliseconds"].values())
+    arithmetic = sum(profile["milliseconds"][part] for part in profiling.ARITHMETIC)
+    assert arithmetic == pytest.approx(sum(profile["kernels"].values()))
+    assert 0 < profile["not_arithmetic"] < 1
+    assert {"patches", "connector", "attention", "to_q", "norm"} <= set(profile["kernels"])
+    assert cli.main(["act", str(whole("n17")), "--embodiment", "10", "--profile"]) == 0
+    out = capsys.readouterr().out
+    assert "is not arithmetic" in out
+    assert all(part in out for part in profiling.PARTS)
+
+
+def test_a_profiled_call_is_a_call_of_act() -> None:
+    policy = Policy.from_pretrained(whole("isaac"))
+    observation = policy.example_observation()
+    seconds = []
+    for _ in range(5):
+        started = time.perf_counter()
+        policy.act(observation, seed=3)
+        seconds.append(time.perf_counter() - started)
+    found = profiling.profile(policy, observation, 3, None)
+    # Machines that run other programs are uneven.
+    assert 0.2 * min(seconds) < 1e-3 * found.total < 5 * max(seconds)

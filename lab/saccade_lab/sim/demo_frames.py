@@ -69,7 +69,7 @@ def main(arguments: list[str]) -> int:
     arrays["task"] = np.array([task.name for task in DEMO_TASKS])
     arrays["camera"] = np.array([camera.name for camera in config.cameras])
     with write_atomically(Path(arguments[0])) as temporary, temporary.open("wb") as file:
-        np.savez_compressed(file, **arrays)
+        np.savez_compressed(file, allow_pickle=False, **arrays)
     return 0
 
 

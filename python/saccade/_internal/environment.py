@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import importlib.metadata
 import os
 import platform
-import re
 from pathlib import Path
 from typing import Any, Literal, overload
 
 import numpy as np
 
 import saccade._saccade as _saccade
-from saccade._internal import extras
 
 #: Other packages that a bug report should name, besides those of the extras.
 OTHERS = ("saccade-vla-lab", "lerobot-policy-saccade", "lerobot", "transformers", "mujoco")
@@ -103,6 +100,11 @@ def caches(folder: Path) -> list[str]:
 
 def packages() -> list[str]:
     """Name and version of each optional package that is installed, in the order of the extras."""
+    import importlib.metadata  # not at the top: `import saccade` should stay cheap
+    import re
+
+    from saccade._internal import extras
+
     requirements = [line for modules in extras.SACCADE.modules.values() for line in modules.values()]
     names = [re.split("[<>=]", line)[0] for line in requirements]
     found = []

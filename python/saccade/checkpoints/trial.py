@@ -158,14 +158,14 @@ def run_head(
         features = np.random.default_rng(seed).standard_normal(
             (1, NUM_VL_TOKENS, config.context_dim), np.float32
         )
-        masks = {}
+        images = None
         if config.mask_mode == "alternate":  # text, then images
-            masks["image_mask"] = np.arange(NUM_VL_TOKENS)[None] >= NUM_VL_TOKENS // 2
+            images = np.arange(NUM_VL_TOKENS)[None] >= NUM_VL_TOKENS // 2
         state = np.zeros((1, config.num_states, config.state_dim), np.float32)
         noise = _noise(config, seed)
-        head(features, state, chosen, noise=noise, **masks)
+        head(features, state, chosen, noise=noise, image_mask=images)
         started = time.perf_counter()
-        actions = np.asarray(head(features, state, chosen, noise=noise, **masks))
+        actions = np.asarray(head(features, state, chosen, noise=noise, image_mask=images))
         spent = time.perf_counter() - started
         apart = None
         if exact is None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import time
 from collections.abc import Mapping
 from pathlib import Path
@@ -30,6 +31,7 @@ examples:
   saccade act GR00T-N1.5-3B/ --embodiment gr1 --data-config fourier_gr1_arms_only --image ego_view=table.png
   saccade act my-policy/ --image front=a.png wrist=b.png --instruction "open the drawer" --state state.json
   saccade act my-policy/ --precision int8 --head-precision bfloat16 --seed 7 --json
+  saccade act my-policy/ --profile
 state.json holds numbers by key, {"single_arm": [0, 0.1, 0, 0, 0], "gripper": [1]}, or one list of all.
 """
 
@@ -63,6 +65,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     arguments.add_seed(parser, "seed of the noise")
     arguments.add_num_steps(parser)
     arguments.add_num_threads(parser, "threads (default: the physical cores)")
+    parser.add_argument("--profile", action="store_true", help="repeat the call, and say where its time goes")
     arguments.add_json(parser)
 
 
@@ -95,6 +98,11 @@ def run(args: argparse.Namespace) -> int:
     clock.done("encode")
     actions = policy.sample(context, given, seed=args.seed, num_steps=args.num_steps)
     clock.done("sample")
+    found = None
+    if args.profile:
+        from saccade.cli import profiling
+
+        found = profiling.profile(policy, given, args.seed, args.num_steps)
     if args.json:
         report = {
             "checkpoint": str(args.checkpoint),
@@ -105,6 +113,8 @@ def run(args: argparse.Namespace) -> int:
             "actions": {key: part[0].tolist() for key, part in actions.items()},
             "milliseconds": clock.milliseconds,
         }
+        if found is not None:
+            report["profile"] = {**dataclasses.asdict(found), "not_arithmetic": found.not_arithmetic}
         output.print_json(report)
         return EXIT_OK
     assumed = [
@@ -114,7 +124,7 @@ def run(args: argparse.Namespace) -> int:
     ]
     if assumed:
         output.note("act", f"using defaults: {', '.join(assumed)}")
-    show([chunk(policy, actions), times(clock)])
+    show([chunk(policy, actions), times(clock), *(profiling.tables(found) if found is not None else ())])
     return EXIT_OK
 
 

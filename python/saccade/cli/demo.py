@@ -11,13 +11,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from saccade._internal.environment import show_config
 from saccade._internal.flags import UsageError
 from saccade.cli import EXIT_OK, drawing
 
 if TYPE_CHECKING:
     from saccade._internal.arrays import Float32Array
     from saccade.checkpoints.demo_frames import Moment
-    from saccade.policy.policy import Policy
 
 HELP = "run the bundled policy on recorded images: try this first"
 EPILOG = """\
@@ -48,15 +48,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Acts, and draws images and actions."""
-    import saccade
+    from saccade.checkpoints import demo_checkpoint
     from saccade.checkpoints.demo_frames import moments
+    from saccade.policy.policy import Policy
 
     recorded = moments()
     if args.task not in recorded:
         raise UsageError(f"--task: unknown name {args.task!r}, expected one of {', '.join(recorded)}")
     moment = recorded[args.task]
     started = time.perf_counter()
-    policy = saccade.Policy.from_pretrained(saccade.demo_checkpoint())
+    policy = Policy.from_pretrained(demo_checkpoint())
     loaded = time.perf_counter() - started
     observation = moment.observation(args.instruction)
     seconds = []
@@ -69,7 +70,7 @@ def run(args: argparse.Namespace) -> int:
     print(f'{moment.task}: "{args.instruction or moment.instruction}"')
     print("\n".join(views(moment)))
     print("\n".join(chart(actions, expert)))
-    print(times(policy, loaded, float(np.median(seconds[1:]))))
+    print(times(policy.head.num_threads, loaded, float(np.median(seconds[1:]))))
     print("Next: saccade act CHECKPOINT, saccade serve CHECKPOINT, saccade --help")
     return EXIT_OK
 
@@ -113,9 +114,8 @@ def values_at(values: Sequence[float], steps: Sequence[int]) -> str:
     return "".join(f"{values[step]:8.2f}" for step in steps)
 
 
-def times(policy: Policy, loaded: float, chunk: float) -> str:
+def times(num_threads: int, loaded: float, chunk: float) -> str:
     """How long loading and a chunk took, and on what."""
-    head = policy.head
-    threads = f"{head.num_threads} thread" + ("" if head.num_threads == 1 else "s")
-    took = f"Loaded in {1e3 * loaded:.0f} ms; {1e3 * chunk:.1f} ms from images to actions"
-    return f"{took} ({head.isa}, {threads})"
+    isa = show_config("dicts")["isa"]
+    threads = f"{num_threads} thread" + ("" if num_threads == 1 else "s")
+    return f"Loaded in {1e3 * loaded:.0f} ms; {1e3 * chunk:.1f} ms from images to actions ({isa}, {threads})"

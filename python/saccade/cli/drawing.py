@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Sequence
-from typing import IO, Literal, TypeAlias
+from typing import Literal, TextIO, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -26,7 +26,7 @@ CUBE = np.array([0, 95, 135, 175, 215, 255])
 RESET = "\x1b[0m"
 
 
-def colours_of(stream: IO[str]) -> Colours:
+def colours_of(stream: TextIO) -> Colours:
     """The colours that a stream shows.
 
     None if it is no terminal, if ``NO_COLOR`` is set, if ``TERM`` is ``dumb``, if its encoding has no half
@@ -35,12 +35,13 @@ def colours_of(stream: IO[str]) -> Colours:
     dumb = os.environ.get("NO_COLOR") or os.environ.get("TERM") == "dumb"
     if dumb or not stream.isatty() or not can_write(stream, HALF_BLOCK):
         return "none"
-    if sys.platform == "win32":
-        return "true" if _understands_escapes() else "none"
-    return "true" if os.environ.get("COLORTERM") in ("truecolor", "24bit") else "256"
+    if sys.platform == "win32" and not _understands_escapes():
+        return "none"
+    has_true = sys.platform == "win32" or os.environ.get("COLORTERM") in ("truecolor", "24bit")
+    return "true" if has_true else "256"
 
 
-def can_write(stream: IO[str], text: str) -> bool:
+def can_write(stream: TextIO, text: str) -> bool:
     """Whether the stream's encoding has all characters of a text."""
     try:
         text.encode(stream.encoding or "ascii")
@@ -51,23 +52,23 @@ def can_write(stream: IO[str], text: str) -> bool:
 
 def _understands_escapes() -> bool:
     """Asks a Windows console to understand escape sequences, which those before Windows 10 cannot."""
-    if sys.platform != "win32":
-        return False
-    import ctypes
+    if sys.platform == "win32":
+        import ctypes
 
-    output, processed, virtual_terminal = -11, 0x1, 0x4  # names of the Windows headers, in lower case
-    kernel = ctypes.windll.kernel32
-    handle, mode = kernel.GetStdHandle(output), ctypes.c_uint32()
-    if not kernel.GetConsoleMode(handle, ctypes.byref(mode)):
-        return False
-    return bool(kernel.SetConsoleMode(handle, mode.value | processed | virtual_terminal))
+        output, processed, virtual_terminal = -11, 0x1, 0x4  # names of the Windows headers, in lower case
+        kernel = ctypes.windll.kernel32
+        handle, mode = kernel.GetStdHandle(output), ctypes.c_uint32()
+        if kernel.GetConsoleMode(handle, ctypes.byref(mode)):
+            return bool(kernel.SetConsoleMode(handle, mode.value | processed | virtual_terminal))
+    return False
 
 
 def shrink(image: UInt8Array, height: int, width: int) -> UInt8Array:
     """An image ``(H, W, 3)`` as ``(height, width, 3)``: each pixel the mean of the area that it covers."""
     rows, columns = coverage(image.shape[0], height), coverage(image.shape[1], width)
     mean = np.einsum("yh,hwc,xw->yxc", rows, image.astype(np.float64), columns)
-    return np.rint(mean).astype(np.uint8)
+    small: UInt8Array = np.rint(mean).astype(np.uint8)
+    return small
 
 
 def coverage(size: int, cells: int) -> npt.NDArray[np.float64]:

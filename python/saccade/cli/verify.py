@@ -13,9 +13,9 @@ from saccade._internal import extras
 from saccade._internal import flags as arguments
 from saccade._internal.environment import show_config
 from saccade._internal.flags import UsageError, add_data_config, add_overrides
-from saccade.cli import EXIT_OK, output
+from saccade.cli import EXIT_OK, LAB, output
 from saccade.cli.output import Section, plain
-from saccade.cli.recorded import LAB, extension
+from saccade.cli.recorded import extension
 
 if TYPE_CHECKING:
     from saccade.checkpoints.trial import Run
