@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import io
 import json
 import os
@@ -15,7 +16,7 @@ import pytest
 
 import saccade
 from saccade import cli
-from saccade._internal.environment import caches
+from saccade._internal.environment import caches, quota
 from saccade.checkpoints.demo_frames import moments
 from saccade.cli import drawing
 
@@ -222,7 +223,8 @@ def test_info_is_what_show_config_says(capsys: pytest.CaptureFixture[str]) -> No
     config = saccade.show_config("dicts")
     assert list(lines) == list(config)
     assert lines["saccade"] == saccade.__version__
-    assert lines["build"].split(", ")[0] in ("debug", "release")
+    library = Path(saccade._saccade.__file__).read_bytes()
+    assert lines["library"] == hashlib.sha256(library).hexdigest()[:12]
     assert config["processors"] >= 1
     assert not [line for line in lines.values() if str(Path.home()) in line]
 
@@ -238,3 +240,36 @@ def test_caches_that_hold_data_are_listed(tmp_path: Path) -> None:
                 (folder / name).write_text(f"{value}\n")
     assert caches(tmp_path) == ["L1 48K", "L2 2048K"]
     assert caches(tmp_path / "missing") == []
+
+
+@pytest.mark.parametrize(
+    ("files", "found"),
+    [
+        ({"proc/self/cgroup": "0::/a/b", "sys/fs/cgroup/a/b/cpu.max": "max 100000"}, None),
+        (
+            {
+                "proc/self/cgroup": "0::/a/b",
+                "sys/fs/cgroup/a/b/cpu.max": "max 100000",
+                "sys/fs/cgroup/a/cpu.max": "150000 100000",
+                "sys/fs/cgroup/cpu.max": "800000 100000",
+            },
+            "1.5",
+        ),
+        (
+            {
+                "proc/self/cgroup": "5:memory:/x\n4:cpu,cpuacct:/x",
+                "sys/fs/cgroup/cpu/cpu.cfs_quota_us": "200000",
+                "sys/fs/cgroup/cpu/cpu.cfs_period_us": "100000",
+                "sys/fs/cgroup/cpu/x/cpu.cfs_quota_us": "-1",
+                "sys/fs/cgroup/cpu/x/cpu.cfs_period_us": "100000",
+            },
+            "2",
+        ),
+        ({}, None),
+    ],
+)
+def test_the_tightest_quota_is_found(files: dict[str, str], found: str | None, tmp_path: Path) -> None:
+    for name, text in files.items():
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text(f"{text}\n")
+    assert quota(tmp_path) == found

@@ -41,8 +41,8 @@ mod _saccade {
     use crate::linalg::{Pca, Ridge, Standardizer, linear_cka, principal_angles};
     #[pymodule_export]
     use crate::machine::{
-        PyProfile, StayOnThisThread, available_isas, build, cpu_quota, cpu_report, default_num_threads,
-        dot_products, measure_peaks, selected_isa,
+        PyProfile, StayOnThisThread, available_isas, cpu_report, default_num_threads, dot_products,
+        measure_peaks, selected_isa,
     };
     #[pymodule_export]
     use crate::policy::Policy;

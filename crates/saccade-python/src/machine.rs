@@ -172,29 +172,3 @@ pub(crate) fn default_num_threads() -> PyResult<usize> {
     let threads = saccade_vla::default_num_threads();
     threads.map(usize::from).map_err(|error| raise(error.into()))
 }
-
-#[pyfunction]
-pub(crate) fn cpu_quota() -> Option<usize> {
-    saccade_vla::cpu_quota()
-}
-
-/// What this library was compiled as: profile, architecture and system, features.
-#[pyfunction]
-pub(crate) fn build() -> Vec<&'static str> {
-    let profile = if cfg!(debug_assertions) {
-        "debug"
-    } else {
-        "release"
-    };
-    let libc = if cfg!(target_env = "musl") {
-        Some("musl")
-    } else {
-        None
-    };
-    let tiles = cfg!(feature = "software-tiles").then_some("software tiles");
-    [profile, std::env::consts::ARCH, std::env::consts::OS]
-        .into_iter()
-        .chain(libc)
-        .chain(tiles)
-        .collect()
-}

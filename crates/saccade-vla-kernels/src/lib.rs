@@ -63,5 +63,5 @@ pub use pool::{
 };
 pub use rotary::rotary_embedding;
 pub use rows::{Rows, RowsMut};
-pub use threads::{NUM_THREADS_VARIABLE, NumThreadsError, cpu_quota, default_num_threads};
+pub use threads::{NUM_THREADS_VARIABLE, NumThreadsError, default_num_threads};
 pub use weights::{Arithmetic, Element, WeightRef, quantize_rows};

@@ -38,16 +38,6 @@ pub fn default_num_threads() -> Result<NonZeroUsize, NumThreadsError> {
     }
 }
 
-/// The quota of the control groups that hold this process (v1 and v2, the tightest), in whole processors, rounded up; `None` where there
-/// is none, and on other systems than Linux.
-#[must_use]
-pub fn cpu_quota() -> Option<usize> {
-    #[cfg(target_os = "linux")]
-    return linux::quota(&linux::read);
-    #[cfg(not(target_os = "linux"))]
-    None
-}
-
 fn parse(given: &str) -> Result<NonZeroUsize, NumThreadsError> {
     given.trim().parse().map_err(|_| NumThreadsError {
         given: given.to_owned(),
@@ -68,11 +58,8 @@ mod linux {
     use std::collections::BTreeSet;
     use std::path::{Path, PathBuf};
 
-    pub(super) fn read(path: &Path) -> Option<String> {
-        std::fs::read_to_string(path).ok()
-    }
-
     pub(super) fn physical_cores() -> Option<usize> {
+        let read = |path: &Path| std::fs::read_to_string(path).ok();
         let cores = allowed_cores(&read)?;
         let quota = quota(&read).unwrap_or(usize::MAX);
         Some(cores.min(quota).max(1))
@@ -129,7 +116,7 @@ mod linux {
     }
 
     /// The tightest quota among the control groups that hold this process, in whole processors, rounded up.
-    pub(super) fn quota(read: &impl Fn(&Path) -> Option<String>) -> Option<usize> {
+    fn quota(read: &impl Fn(&Path) -> Option<String>) -> Option<usize> {
         let groups = read(Path::new("/proc/self/cgroup"))?;
         let mut tightest = None;
         for line in groups.lines() {

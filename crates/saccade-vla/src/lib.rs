@@ -91,7 +91,7 @@ pub use saccade_vla_checkpoint as files;
 #[cfg(feature = "peak")]
 pub use saccade_vla_kernels::peak;
 pub use saccade_vla_kernels::{
-    Arithmetic, CpuReport, Isa, StayOnThisThread, cpu_quota, default_num_threads, stay_on_this_thread,
+    Arithmetic, CpuReport, Isa, StayOnThisThread, default_num_threads, stay_on_this_thread,
 };
 pub use sampling::chunking::Chunking;
 pub use sampling::integrator::Integrator;

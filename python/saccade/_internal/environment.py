@@ -10,6 +10,7 @@ from typing import Any, Literal, overload
 import numpy as np
 
 import saccade._saccade as _saccade
+from saccade._internal.files import sha256_of
 
 #: Other packages that a bug report should name, besides those of the extras.
 OTHERS = ("saccade-vla-lab", "lerobot-policy-saccade", "lerobot", "transformers", "mujoco")
@@ -22,7 +23,7 @@ def show_config(mode: Literal["dicts"]) -> dict[str, Any]: ...
 def show_config(mode: Literal["stdout", "dicts"] = "stdout") -> dict[str, Any] | None:
     """Prints what a head that is loaded now would use on this machine. ``saccade info`` prints the same.
 
-    - ``build``: how the library was compiled: profile, architecture, system, features.
+    - ``library``: the beginning of the SHA-256 of the compiled library, which tells builds apart.
     - ``isa``: the instruction set. The environment variable ``SACCADE_ISA`` selects one of
       ``available_isas``.
     - ``cpu``: the name of the processor, where the system reports one.
@@ -33,7 +34,8 @@ def show_config(mode: Literal["stdout", "dicts"] = "stdout") -> dict[str, Any] |
     - ``tiles``: whether AMX can be used; if not, why.
     - ``num_threads``: the default number of threads, which ``SACCADE_NUM_THREADS`` sets.
     - ``processors``: the number of logical processors that this process may use, and ``quota`` how many of
-      them its control group grants at a time; None without a quota.
+      them its control groups grant at a time, as ``"1.5"``; None without a quota, and on other systems than
+      Linux. Both are already in ``num_threads``.
     - ``caches``: of one processor, as Linux reports them: ``"L2 1024K"``. Empty elsewhere.
     - ``packages``: the optional packages that are installed, with their versions.
 
@@ -52,7 +54,7 @@ def show_config(mode: Literal["stdout", "dicts"] = "stdout") -> dict[str, Any] |
     family, rates, tiles = _saccade.cpu_report()
     config = {
         "saccade": _saccade.__version__,
-        "build": _saccade.build(),
+        "library": sha256_of(Path(_saccade.__file__))[:12],
         "cpu": cpu_name(),
         "isa": isa,
         "dot_products": _saccade.dot_products(),
@@ -62,7 +64,7 @@ def show_config(mode: Literal["stdout", "dicts"] = "stdout") -> dict[str, Any] |
         "tiles": tiles,
         "num_threads": _saccade.default_num_threads(),
         "processors": usable_processors(),
-        "quota": _saccade.cpu_quota(),
+        "quota": quota(Path("/")),
         "caches": caches(Path("/sys/devices/system/cpu/cpu0/cache")),
         "numpy": np.__version__,
         "python": platform.python_version(),
@@ -83,6 +85,44 @@ def usable_processors() -> int:
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
+
+
+def quota(root: Path) -> str | None:
+    """The tightest quota of the control groups that hold this process, in processors.
+
+    The engine reads the same files for its number of threads, and rounds up.
+
+    Args:
+        root: The root of the file system; tests have one of their own.
+    """
+    try:
+        lines = (root / "proc/self/cgroup").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        return None
+    found = []
+    for line in lines:
+        _, controllers, group = line.split(":", 2)
+        is_second = controllers == ""  # version 2 has one hierarchy for all controllers
+        if not is_second and "cpu" not in controllers.split(","):
+            continue
+        base = root / "sys/fs/cgroup" / ("" if is_second else "cpu")
+        # A limit may be on any group above; in a container the root is its own group.
+        folder = base / group.lstrip("/")
+        while True:
+            try:
+                if is_second:
+                    words = (folder / "cpu.max").read_text().split()
+                else:
+                    names = ("cpu.cfs_quota_us", "cpu.cfs_period_us")
+                    words = [(folder / name).read_text().strip() for name in names]
+            except OSError:
+                words = []
+            if len(words) == 2 and words[0].isdecimal() and words[1].isdecimal() and int(words[1]) > 0:
+                found.append(int(words[0]) / int(words[1]))
+            if folder == base:
+                break
+            folder = folder.parent
+    return f"{min(found):g}" if found else None
 
 
 def caches(folder: Path) -> list[str]:

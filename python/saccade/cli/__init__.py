@@ -31,7 +31,7 @@ from saccade.errors import SaccadeError
 # `saccade --help` imports none of them; a test compares the two.
 COMMANDS: dict[str, str] = {
     "demo": "run the bundled policy on recorded images: try this first",
-    "info": "say what a bug report needs: version, build, CPU, packages",
+    "info": "say what a bug report needs: version, CPU, packages",
     "act": "run a whole checkpoint on images and an instruction",
     "serve": "serve a whole checkpoint to robots over the network",
     "inspect": "show what a checkpoint contains",

@@ -8,7 +8,7 @@ from saccade._internal import flags as arguments
 from saccade._internal.environment import show_config
 from saccade.cli import EXIT_OK, output
 
-HELP = "say what a bug report needs: version, build, CPU, packages"
+HELP = "say what a bug report needs: version, CPU, packages"
 EPILOG = """\
 The same as saccade.show_config() in Python. Nothing in it names a person or a path.
 

@@ -101,7 +101,7 @@ def report(found: Verification) -> list[str]:
     what = "not recognised" if found.version is None else f"GR00T {found.version.upper()}, {found.layout}"
     lines = [
         f"checkpoint  {name}: {what}",
-        f"saccade     {found_build(machine)}",
+        f"saccade     {build_of(machine)}",
         f"machine     {machine['cpu']}; {machine['isa']}; {machine['num_threads']} threads",
     ]
     lines += listed("tensors", [part(name, tensors) for name, tensors in found.tensors.items()])
@@ -135,11 +135,10 @@ def without_folder(text: str, checkpoint: Path) -> str:
     return text
 
 
-def found_build(machine: dict[str, object]) -> str:
-    """Version and build."""
-    build = machine["build"]
-    assert isinstance(build, list)
-    return f"{machine['saccade']} ({', '.join(build)}); Python {machine['python']}; {machine['system']}"
+def build_of(machine: dict[str, object]) -> str:
+    """Version, library, Python and system."""
+    library = f"library {machine['library']}"
+    return f"{machine['saccade']} ({library}); Python {machine['python']}; {machine['system']}"
 
 
 def listed(name: str, values: list[str]) -> list[str]:
