@@ -100,6 +100,17 @@ class Environment:
             self.done(name, made_from)
         return self
 
+    def lies_on(self, below: Environment) -> Environment:
+        """Adds the packages of another environment, after its own."""
+        where = "import sysconfig; print(sysconfig.get_path('purelib'))"
+        found = (
+            self.session.run(str(one.python), "-c", where, silent=True, external=True, log=False)
+            for one in (below, self)
+        )
+        theirs, own = (Path(str(path).strip()) for path in found)
+        (own / "below.pth").write_text(f"import site; site.addsitedir({str(theirs)!r})\n")
+        return self
+
     def install_saccade(self, *, editable: bool = True) -> Environment:
         """Installs saccade, and builds its extension if what that is made from has changed."""
         package = ROOT / "python" / "saccade"
@@ -202,9 +213,16 @@ def run_python_tests(environment: Environment) -> None:
 
 @nox.session
 def core(session: nox.Session) -> None:
-    """Run the tests that need the wheel of saccade, NumPy and pytest only."""
+    """Run the tests that need the wheel of saccade, NumPy and pytest only.
+
+    NUMPY is another version of NumPy than that of requirements/core.txt, or `newest`.
+    """
     needs(session, "python", "rust")
-    environment = Environment(session, ENVIRONMENTS / "core").install("core").install_saccade(editable=False)
+    numpy = os.environ.get("NUMPY", "")
+    environment = Environment(session, ENVIRONMENTS / f"core{numpy}").install("core")
+    if numpy:
+        environment.pip("--upgrade", "numpy" if numpy == "newest" else f"numpy=={numpy}")
+    environment.install_saccade(editable=False)
     options = ("--numprocesses", "auto", "--dist", "worksteal", *session.posargs)
     environment.run("-m", "pytest", "tests", "-m", "core", *options, OMP_NUM_THREADS="1")
 
@@ -224,6 +242,25 @@ def lint(session: nox.Session) -> None:
     for command in ("ruff check .", "ruff format --check .", "mypy", "stubtest saccade._saccade", deny):
         program, *options = command.split()
         session.run(environment.program(program), *options, external=True)
+
+
+@nox.session
+def workflows(session: nox.Session) -> None:
+    """Check the workflows of GitHub, the issue forms and the citation, without the network."""
+    environment = Environment(session, ENVIRONMENTS / "workflows").install("workflows")
+    folder = ROOT / ".github"
+    config = folder / "ISSUE_TEMPLATE" / "config.yml"
+    schemas = {
+        "vendor.github-workflows": sorted((folder / "workflows").glob("*.yml")),
+        "vendor.github-issue-forms": sorted({*config.parent.glob("*.yml")} - {config}),
+        "vendor.github-issue-config": [config],
+        "vendor.dependabot": [folder / "dependabot.yml"],
+        "vendor.citation-file-format": [ROOT / "CITATION.cff"],
+    }
+    for schema, files in schemas.items():
+        command = (environment.program("check-jsonschema"), "--builtin-schema", schema, *map(str, files))
+        session.run(*command, external=True)
+    session.run(environment.program("zizmor"), "--offline", "--no-progress", str(folder), external=True)
 
 
 @nox.session
@@ -337,13 +374,7 @@ def record_libero_clients(session: nox.Session, below: Environment) -> Path:
     made_from = digest(lists)
     if not environment.is_done("packages", made_from):
         print("setup: hf-libero and lerobot (takes minutes the first time)", flush=True)
-        where = "import sysconfig; print(sysconfig.get_path('purelib'))"
-        found = (
-            session.run(str(one.python), "-c", where, silent=True, external=True, log=False)
-            for one in (below, environment)
-        )
-        theirs, own = (Path(str(path).strip()) for path in found)
-        (own / "below.pth").write_text(f"{theirs}\n")
+        environment.lies_on(below)
         environment.pip(*(part for file in lists for part in ("--requirement", file)))
         environment.done("packages", made_from)
     made_from = digest([*lists, program])

@@ -36,6 +36,8 @@ FILES: dict[str, tuple[list[str], list[str]]] = {
     "libero": (["saccade-vla[data]", "saccade-vla-lab[libero]"], ["build", "test"]),
     "peers": ([], ["peers"]),
     "lock": ([], ["lock"]),
+    "workflows": ([], ["workflows"]),
+    "audit": ([], ["audit"]),
     "wheels": ([], ["wheels"]),
 }
 APART = ("dev", "wheels")

