@@ -111,17 +111,21 @@ def count(name: str, folder: Path) -> list[Counts]:
 
 
 def table(rows: list[Mapping[str, Any]]) -> str:
-    """The rows as a table of Markdown."""
-    lines = [
-        "| recording | control steps apart | noise | observations | a view is the same | all are |",
-        "| --- | --- | --- | --- | --- | --- |",
-    ]
+    """Markdown: a row for each recording and interval, a column for each noise.
+
+    A cell is the share of observations with at least one view as before.
+    """
+    by_interval: dict[tuple[str, int], dict[float, Mapping[str, Any]]] = {}
     for row in rows:
-        some, whole = (f"{row[key] / row['observations']:.1%}" for key in ("some_same", "all_same"))
-        lines.append(
-            f"| {row['recording']} | {row['control_steps']} | {row['noise']:g} | {row['observations']} | "
-            f"{some} | {whole} |"
-        )
+        by_interval.setdefault((row["recording"], row["control_steps"]), {})[row["noise"]] = row
+    lines = [
+        "| recording | control steps apart | observations |" + "".join(f" noise {one:g} |" for one in NOISE),
+        "|---|---|---|" + "---|" * len(NOISE),
+    ]
+    for (name, steps), by_noise in by_interval.items():
+        cells = [f"{row['some_same'] / row['observations']:.1%}" for row in by_noise.values()]
+        count = by_noise[0.0]["observations"]
+        lines.append(f"| {name} | {steps} | {count} | {' | '.join(cells)} |")
     return "\n".join(lines)
 
 

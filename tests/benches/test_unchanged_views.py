@@ -53,3 +53,9 @@ def test_views_are_counted(recording: Path, monkeypatch: pytest.MonkeyPatch) -> 
 def test_no_recording_is_named(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match="no recording"):
         unchanged_views.count("x", tmp_path)
+
+
+def test_the_page_shows_the_record() -> None:
+    rows = json.loads(unchanged_views.RECORD.read_text())["rows"]
+    page = (Path(unchanged_views.__file__).parents[1] / "docs" / "real-time.md").read_text()
+    assert unchanged_views.table(rows) in page
