@@ -2,6 +2,7 @@
 # make test      run all tests, Rust and Python             (PYTEST_ARGS="-k NAME")
 # make lint      formatting, clippy, rustdoc, ruff, mypy, stubs
 # make format    format all Rust and Python files
+# make docs      the documentation site, in out/site/html
 # make bench     measure kernels and head beside other implementations, with cargo bench
 # make help      the other tasks
 #
@@ -13,7 +14,7 @@ VENV := .venv
 ROLLOUT_OUT ?= out/rollout
 ROLLOUT_ARGS ?= --episodes 3 --video
 
-SESSIONS := rollout test lint format workflows bench package setup core test-rust test-python test-compat test-clients test-ray test-libero \
+SESSIONS := rollout test lint format docs workflows bench package setup core test-rust test-python test-compat test-clients test-ray test-libero \
 	test-aarch64 test-i686 bench-peers sanitize portable loom fuzz wheel test-wheel demo-policy pictures lock
 
 .DEFAULT_GOAL := help

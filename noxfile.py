@@ -245,6 +245,17 @@ def lint(session: nox.Session) -> None:
 
 
 @nox.session
+def docs(session: nox.Session) -> None:
+    """Build the documentation site in out/site/html; a warning or a link that leads nowhere is an error."""
+    if sys.version_info < (3, 11):
+        session.error("needs Python 3.11 or newer: make PYTHON=/path/to/python3 docs, after make clean")
+    below = working(session)
+    environment = Environment(session, ENVIRONMENTS / "docs").install("docs").lies_on(below)
+    variables = {"OMP_NUM_THREADS": "1", "MUJOCO_GL": "egl"}
+    environment.run("docs/site/build.py", *session.posargs, **variables)
+
+
+@nox.session
 def workflows(session: nox.Session) -> None:
     """Check the workflows of GitHub, the issue forms and the citation, without the network."""
     environment = Environment(session, ENVIRONMENTS / "workflows").install("workflows")

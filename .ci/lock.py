@@ -36,6 +36,7 @@ FILES: dict[str, tuple[list[str], list[str]]] = {
     "libero": (["saccade-vla[data]", "saccade-vla-lab[libero]"], ["build", "test"]),
     "peers": ([], ["peers"]),
     "lock": ([], ["lock"]),
+    "docs": ([], ["docs"]),
     "workflows": ([], ["workflows"]),
     "audit": ([], ["audit"]),
     "wheels": ([], ["wheels"]),

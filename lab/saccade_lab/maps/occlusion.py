@@ -51,8 +51,10 @@ class Occlusion:
     Attributes:
         method: How patches were removed.
         cell: Patches along each side of what was removed at once.
-        change: Mean |change| of the normalised actions by camera, ``(rows, columns)``, from equal noise.
-        other_noise: Mean |change| between chunks of the whole observation from different noise, to compare.
+        change: Mean absolute change of the normalised actions by camera, ``(rows, columns)``, from equal
+            noise.
+        other_noise: Mean absolute change between chunks of the whole observation from different noise, to
+            compare.
     """
 
     method: str

@@ -95,7 +95,7 @@ def make(task: str, **options: Any) -> LeRobotObservation:
     """A task with lerobot's names.
 
     Args:
-        task, **options: As in :class:`saccade_lab.sim.environment.TaskEnvironment`.
+        task, options: As in :class:`saccade_lab.sim.environment.TaskEnvironment`.
     """
     return LeRobotObservation(TaskEnvironment(task, **options))
 

@@ -153,7 +153,7 @@ class ArmStudy(Study):
 
 
 def between_draws(chunks: Float32Array) -> float | None:
-    """The mean |difference| of an action between two chunks of one observation from different noise.
+    """The mean absolute difference of an action between two chunks of one observation from different noise.
 
     Args:
         chunks: ``(1, draws, horizon, action_dim)``.

@@ -22,7 +22,7 @@ class ArmChange:
 
     Attributes:
         observations: Number of observations.
-        change: Mean |change| of an action; None if it was not measured.
+        change: Mean absolute change of an action; None if it was not measured.
         ratio: ``change`` divided by the change that another noise makes; None where noise was not drawn.
         largest: The largest change of one action.
         note: Why it was not measured.

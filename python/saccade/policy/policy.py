@@ -201,8 +201,8 @@ class Policy:
 
         Args:
             observation, previous: As in :meth:`encode`.
-            noise, seed, num_steps, integrator, num_samples, future_refresh, intervention, previous_chunk,
-                chunking, guidance: As in :meth:`sample`.
+            noise, seed, num_steps, integrator, num_samples, future_refresh: As in :meth:`sample`.
+            intervention, previous_chunk, chunking, guidance: As in :meth:`sample`.
             without: As in :meth:`encode`. Default: ``"default"`` if ``guidance`` needs it.
 
         Returns:
@@ -371,8 +371,8 @@ class Policy:
 
         Args:
             backbone_features, attention_mask, image_mask, drop_vl: As in :meth:`saccade.ActionHead.encode`.
-            state, noise, seed, num_steps, integrator, num_samples, future_refresh, intervention,
-                previous_chunk, chunking: As in :meth:`sample`.
+            state, noise, seed, num_steps, integrator, num_samples, future_refresh: As in :meth:`sample`.
+            intervention, previous_chunk, chunking: As in :meth:`sample`.
 
         Returns:
             As :meth:`sample` with a state.

@@ -15,9 +15,11 @@ from saccade.errors import InputError
 
 _RELEASED = json.loads(Path(__file__).with_name("released_embodiments.json").read_text(encoding="utf-8"))
 
-#: The ids of each release by tag. In N1 and N1.5, ``genie1_gripper`` is an old name of ``agibot_genie1``.
+#: The ids of N1 and N1.5 by tag. There ``genie1_gripper`` is an old name of ``agibot_genie1``.
 N15_IDS: Mapping[str, int] = _RELEASED["ids"]["n1.5"]
+#: The ids of N1.6 by tag.
 N16_IDS: Mapping[str, int] = _RELEASED["ids"]["n1.6"]
+#: The ids of N1.7 by tag.
 N17_IDS: Mapping[str, int] = _RELEASED["ids"]["n1.7"]
 #: The ids of lerobot's own table for N1.5, where a step has none.
 LEROBOT_N15_IDS: Mapping[str, int] = _RELEASED["ids"]["lerobot n1.5"]

@@ -38,7 +38,7 @@ class ArmResult:
         name: Name of the arm.
         rate, episodes: Success, and the number of episodes.
         pairs: The comparison with the unchanged policy.
-        change: Mean |change| of an action.
+        change: Mean absolute change of an action.
         note: Why it was not measured.
         corrected_p: P value of McNemar's test, corrected by Holm for all arms except the control.
     """

@@ -43,9 +43,9 @@ class ModeResult:
 
     Attributes:
         name: Name of the mode.
-        change: Mean |difference| of an action from the baseline's.
+        change: Mean absolute difference of an action from the baseline's.
         ratio: ``change`` divided by the difference that another noise makes.
-        error: Mean |difference| of an action from many small steps.
+        error: Mean absolute difference of an action from many small steps.
         successes, episodes: On the tasks that count.
         pairs: The comparison with the baseline on these tasks.
         p_loss: P value of a loss of ``LOSS_THAT_MATTERS``, corrected by Holm; None for modes without a
