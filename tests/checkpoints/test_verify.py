@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -19,6 +20,8 @@ from saccade.checkpoints import convert, verify
 from saccade.checkpoints.finite import count_not_finite
 from saccade.checkpoints.precisions import PRECISIONS
 from saccade.checkpoints.verification import TOLERANCE
+from saccade.cli.verify import without_folder
+from saccade.errors import CheckpointError, InputError, MissingExtraError
 from saccade_lab.against_reference import reference
 from saccade_lab.random_checkpoint.whole import small_backbone, small_head, write
 from tests.helpers import layouts
@@ -170,6 +173,77 @@ def test_a_difference_from_the_reference_fails() -> None:
     assert nan.verdict == "failed"
 
 
+def test_a_head_alone_cannot_be_compared_with_the_reference(tmp_path: Path) -> None:
+    convert(saccade.demo_checkpoint(), tmp_path / "head", head_only=True)
+    found = verify(tmp_path / "head", reference=reference)
+    assert (found.verdict, found.part, found.problems) == ("incomplete", "head", [])
+    assert found.refused is not None
+    assert "no backbone" in found.refused
+
+
+def test_a_reference_without_its_packages_is_not_a_refused_policy() -> None:
+    def lacks(policy: Any, observation: Any, noise: Any) -> Callable[[], dict[str, float]]:
+        raise MissingExtraError("torch is not installed", name="torch")
+
+    with pytest.raises(MissingExtraError, match="torch is not installed"):
+        verify(saccade.demo_checkpoint(), reference=lacks)
+
+
+def test_the_robot_of_a_head_alone_is_never_another_than_the_given_one(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    source = tmp_path / "head"
+    convert(whole("n17"), source, head_only=True)
+    found = verify(source, embodiment=EMBODIMENT)
+    expected = saccade.robots.Normalizer.from_pretrained(source, EMBODIMENT).embodiment_id
+    assert (found.verdict, found.robot) == ("passed", str(expected))
+    assert verify(source, embodiment=3).robot == "3"
+    with pytest.raises(
+        InputError, match=f"no id of 'no_such_robot', expected an id or one of .*{EMBODIMENT}"
+    ):
+        verify(source, embodiment="no_such_robot")
+    assert cli.main(["verify", str(source), "--embodiment", "3"]) == 0
+    assert "the head alone, as embodiment 3, on random features" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("kept", [True, False])
+def test_weights_too_large_for_the_arithmetic_are_named_at_each_precision(kept: bool, tmp_path: Path) -> None:
+    def large(tensors: dict[str, torch.Tensor]) -> None:
+        tensors[HEAD] = tensors[HEAD] * 1e38
+        for name in [name for name in tensors if not kept and name.startswith("backbone.")]:
+            del tensors[name]
+
+    found = verify(damaged(tmp_path / "policy", large))
+    assert (found.verdict, found.refused, found.part) == ("failed", None, "policy" if kept else "head")
+    assert found.problems[0].startswith("float32: actions: the result is not finite")
+    assert len(found.runs) == len(PRECISIONS) if kept else len(found.runs) >= 3
+
+
+def test_what_fails_at_one_precision_keeps_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
+    load = saccade.Policy.from_pretrained.__func__  # type: ignore[attr-defined]
+
+    def refusing(cls: Any, /, source: Any, **options: Any) -> Any:
+        if options["precision"] == PRECISIONS["int8"]:
+            raise CheckpointError("a weight is too large\nfor int8")
+        return load(cls, source, **options)
+
+    monkeypatch.setattr(saccade.Policy, "from_pretrained", classmethod(refusing))
+    found = verify(saccade.demo_checkpoint())
+    assert found.problems == ["int8: a weight is too large; for int8"]
+    assert (found.part, found.refused, len(found.runs)) == ("policy", None, len(PRECISIONS))
+
+
+def test_the_report_names_neither_the_folders_above_nor_the_home(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HOME", f"{os.sep}home{os.sep}me")
+    monkeypatch.setenv("USERPROFILE", f"{os.sep}home{os.sep}me")
+    home, source = Path(os.sep) / "home" / "me", Path("o") / "p"
+    text = f"{home / 'tokenizer.json'}: broken; {source / 'config.json'}: cut off; neuro{os.sep}GR00T"
+    wanted = (
+        f"{Path('~') / 'tokenizer.json'}: broken; {Path('p') / 'config.json'}: cut off; neuro{os.sep}GR00T"
+    )
+    assert without_folder(text, source) == wanted
+
+
 def test_actions_that_are_not_finite_fail(monkeypatch: pytest.MonkeyPatch) -> None:
     act = saccade.Policy.act
 
@@ -239,7 +313,12 @@ def test_values_that_are_not_finite_are_counted(
     spoiled = values.clone()
     spoiled[3, 4], spoiled[6, 10] = float("nan"), float("-inf")
     save_file({"a": values, "b": spoiled, "c": torch.ones(3, dtype=torch.int8)}, tmp_path / "x.safetensors")
-    done: list[int] = []
-    assert count_not_finite([tmp_path / "x.safetensors"], done.append) == {"b": (2, 77)}
-    assert done == sorted(done)
-    assert done[-1] in (2 * values.nbytes, 2 * values.nbytes + 3)
+    assert count_not_finite([tmp_path / "x.safetensors"]) == {"b": (2, 77)}
+
+
+def test_a_file_that_is_cut_off_while_it_is_read_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "x.safetensors"
+    save_file({"a": torch.ones(7, 11)}, path)
+    path.write_bytes(path.read_bytes()[:-7])
+    with pytest.raises(CheckpointError, match="ends within a, 7 bytes too early"):
+        count_not_finite([path])

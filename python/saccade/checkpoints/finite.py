@@ -7,10 +7,12 @@ is named. The bits of the exponent decide, so nothing is converted.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
+
+from saccade.errors import CheckpointError
 
 #: The exponent of each type of floating point: a value is NaN or infinite if all of its bits are set. And the
 #: unsigned integers of its size.
@@ -24,17 +26,17 @@ EXPONENTS = {
 PIECE = 1 << 24
 
 
-def count_not_finite(
-    files: Iterable[Path], progress: Callable[[int], object] | None = None
-) -> dict[str, tuple[int, int]]:
+def count_not_finite(files: Iterable[Path]) -> dict[str, tuple[int, int]]:
     """Tensors with values that are NaN or infinite: how many of them, and the number of all values.
 
     Args:
         files: Safetensors files whose headers were checked before, as opening a checkpoint does.
-        progress: Called with the number of bytes that were read so far, of all files.
 
     Returns:
         By name, in the order of the files.
+
+    Raises:
+        CheckpointError: A file ends before its header says, because somebody is writing it.
 
     Example:
         >>> import saccade
@@ -42,7 +44,6 @@ def count_not_finite(
         {}
     """
     found: dict[str, tuple[int, int]] = {}
-    done = 0
     for path in files:
         with path.open("rb") as file:
             length = int.from_bytes(file.read(8), "little")
@@ -50,19 +51,21 @@ def count_not_finite(
             header.pop("__metadata__", None)
             for name, entry in sorted(header.items(), key=lambda item: item[1]["data_offsets"]):
                 first, end = entry["data_offsets"]
-                if entry["dtype"] in EXPONENTS:
-                    mask, integers = EXPONENTS[entry["dtype"]]
-                    bits, count, left = np.dtype(integers), 0, end - first
-                    file.seek(8 + length + first)
-                    while left > 0:
-                        values = np.frombuffer(file.read(min(PIECE, left)), bits)
-                        count += int(np.count_nonzero((values & bits.type(mask)) == mask))
-                        left -= values.nbytes
-                        done += values.nbytes
-                        if progress is not None:
-                            progress(done)
-                    if count:
-                        found[name] = (count, (end - first) // bits.itemsize)
-                else:
-                    done += end - first
+                if entry["dtype"] not in EXPONENTS:
+                    continue
+                mask, integers = EXPONENTS[entry["dtype"]]
+                bits, count, left = np.dtype(integers), 0, end - first
+                file.seek(8 + length + first)
+                while left > 0:
+                    piece = file.read(min(PIECE, left))
+                    if len(piece) < min(PIECE, left):
+                        missing = left - len(piece)
+                        raise CheckpointError(
+                            f"{path}: ends within {name}, {missing} bytes too early: it was cut off meanwhile"
+                        )
+                    values = np.frombuffer(piece, bits)
+                    count += int(np.count_nonzero((values & bits.type(mask)) == mask))
+                    left -= values.nbytes
+                if count:
+                    found[name] = (count, (end - first) // bits.itemsize)
     return found

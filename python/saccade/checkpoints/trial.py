@@ -10,9 +10,9 @@ from typing import Any, Protocol
 
 import numpy as np
 
-import saccade._saccade as _saccade
 from saccade._internal.arrays import Float32Array
 from saccade.checkpoints.precisions import PRECISIONS, Difference, difference
+from saccade.errors import SaccadeError
 from saccade.head.config import HeadConfig
 from saccade.head.head import ActionHead
 from saccade.policy.policy import Policy
@@ -87,8 +87,9 @@ def run_policy(
         say: Called with what is done next.
 
     Raises:
-        CheckpointError, InputError, FileNotFoundError: It cannot be loaded, or the example observation is
-            refused.
+        CheckpointError, InputError, FileNotFoundError: It cannot be loaded in float32, or there is no example
+            observation of it. What fails later is the problem of a run.
+        MissingExtraError: The reference lacks a package.
     """
     found = PolicyRuns()
     exact: dict[str, Float32Array] | None = None
@@ -96,23 +97,27 @@ def run_policy(
     for name, precision in PRECISIONS.items():
         say(f"a chunk in {name}")
         started = time.perf_counter()
+        accepted = name != "float32"  # what float32 accepts, the other precisions must too
         try:
             policy = Policy.from_pretrained(source, precision=precision, **options)
             loaded = time.perf_counter() - started
             observation = policy.example_observation(seed)
+            found.robot = policy.normalizer.embodiment or str(policy.embodiment_id)
+            accepted = True
             noise = _noise(policy.head.config, seed)
             policy.act(observation, noise=noise)
             started = time.perf_counter()
             chunk = {key: part[0] for key, part in policy.act(observation, noise=noise).items()}
             spent = time.perf_counter() - started
-        except MemoryError as error:
-            found.runs.append(Run(name, problem=f"too large for this machine's memory: {error}"))
+        except (MemoryError, SaccadeError) as error:
+            if not accepted and not isinstance(error, MemoryError):
+                raise
+            found.runs.append(Run(name, problem=_why(error)))
             continue
         groups = policy.normalizer.action_groups
         apart, problem = None, not_finite(chunk)
         if name == "float32":
             exact = chunk if problem is None else None
-            found.robot = policy.normalizer.embodiment or str(policy.embodiment_id)
             compare = None if reference is None else reference(policy, observation, noise)
         elif exact is not None and problem is None:
             apart = difference([_batched(exact)], [_batched(chunk)], groups)
@@ -126,7 +131,7 @@ def run_policy(
 
 def run_head(
     source: Path,
-    embodiment: str | int | None,
+    embodiment_id: int,
     num_threads: int | None,
     seed: int,
     say: Callable[[str], object],
@@ -135,24 +140,28 @@ def run_head(
 
     Args:
         source: The checkpoint.
-        embodiment: An id; a tag or None takes the first one that the checkpoint still has.
+        embodiment_id: The embodiment whose layers are used.
         num_threads: As for :meth:`saccade.ActionHead.from_pretrained`.
         seed: Seed of features and noise.
         say: Called with what is done next.
 
     Raises:
-        CheckpointError, InputError: It cannot be loaded.
+        CheckpointError, InputError: It cannot be loaded in float32. What fails later is the problem of a run.
     """
-    kept = _saccade.HeadCheckpoint.open(str(source), None).kept_embodiments() or [0]
-    chosen = embodiment if isinstance(embodiment, int) else kept[0]
     runs: list[Run] = []
     exact: Float32Array | None = None
     for name in dict.fromkeys(precision["head"] for precision in PRECISIONS.values()):
         say(f"a chunk of the head in {name}")
         started = time.perf_counter()
-        head = ActionHead.from_pretrained(
-            source, embodiment_ids=[chosen], precision=name, num_threads=num_threads
-        )
+        try:
+            head = ActionHead.from_pretrained(
+                source, embodiment_ids=[embodiment_id], precision=name, num_threads=num_threads
+            )
+        except (MemoryError, SaccadeError) as error:
+            if name == "float32" and not isinstance(error, MemoryError):
+                raise
+            runs.append(Run(name, problem=_why(error)))
+            continue
         loaded = time.perf_counter() - started
         config = head.config
         features = np.random.default_rng(seed).standard_normal(
@@ -163,14 +172,18 @@ def run_head(
             images = np.arange(NUM_VL_TOKENS)[None] >= NUM_VL_TOKENS // 2
         state = np.zeros((1, config.num_states, config.state_dim), np.float32)
         noise = _noise(config, seed)
-        head(features, state, chosen, noise=noise, image_mask=images)
-        started = time.perf_counter()
-        actions = np.asarray(head(features, state, chosen, noise=noise, image_mask=images))
-        spent = time.perf_counter() - started
+        try:
+            head(features, state, embodiment_id, noise=noise, image_mask=images)
+            started = time.perf_counter()
+            actions = np.asarray(head(features, state, embodiment_id, noise=noise, image_mask=images))
+            spent = time.perf_counter() - started
+        except (MemoryError, SaccadeError) as error:
+            runs.append(Run(name, problem=_why(error)))
+            continue
         apart = None
-        if exact is None:
+        if name == "float32":
             exact = actions
-        else:
+        elif exact is not None:
             largest = float(np.abs(actions.astype(np.float64) - exact).max())
             apart = Difference({NORMALISED: largest}, {NORMALISED: largest / 2})  # from -1 to 1
         runs.append(Run(name, head.nbytes, loaded, 1e3 * spent, apart, not_finite({NORMALISED: actions})))
@@ -182,6 +195,17 @@ def not_finite(chunk: Mapping[str, Float32Array]) -> str | None:
     """Says which actions are NaN or infinite; None if none are."""
     wrong = [key for key, part in chunk.items() if not np.isfinite(part).all()]
     return f"NaN or infinity in the actions of {', '.join(wrong)}" if wrong else None
+
+
+def lines_of(error: BaseException) -> list[str]:
+    """The lines of a message: each names a problem."""
+    return [line.strip() for line in str(error).splitlines() if line.strip()]
+
+
+def _why(error: MemoryError | SaccadeError) -> str:
+    """The problem of a run, on one line."""
+    text = "; ".join(lines_of(error))
+    return f"too large for this machine's memory: {text}" if isinstance(error, MemoryError) else text
 
 
 def _noise(config: HeadConfig, seed: int) -> Float32Array:

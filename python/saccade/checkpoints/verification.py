@@ -17,9 +17,9 @@ from saccade._internal.hub import resolve
 from saccade._internal.hub_files import WEIGHTS
 from saccade.checkpoints.description import Description, Source, description_of, open_published
 from saccade.checkpoints.finite import count_not_finite
-from saccade.checkpoints.trial import Reference, Run, run_head, run_policy
+from saccade.checkpoints.trial import Reference, Run, lines_of, run_head, run_policy
 from saccade.checkpoints.whole import RobotFindings, robots_of
-from saccade.errors import SaccadeError
+from saccade.errors import InputError, MissingExtraError, SaccadeError
 from saccade.robots import DataConfigLike
 
 #: At this error against the reference, of an action's range, code or files are wrong: rounding of float32
@@ -58,12 +58,12 @@ class Verification:
     robots: list[RobotFindings] = field(default_factory=list)
     """The robots whose statistics are among the files, and why one cannot be used as it is."""
     refused: str | None = None
-    """Why the whole policy was not run, although the checkpoint has a backbone."""
+    """Why the whole policy was not run, although the checkpoint has a backbone or a reference was given."""
     part: Literal["policy", "head"] | None = None
     """What was run: the whole policy, from frames to actions in the robot's units, or the head alone, on
     random features, to normalised actions. None if nothing was."""
     robot: str | None = None
-    """The robot whose actions were computed."""
+    """The robot whose actions were computed: its tag, or else its id. Of a head alone its id."""
     runs: list[Run] = field(default_factory=list)
     """One of each precision, float32 first."""
     reference: dict[str, float] | None = None
@@ -109,7 +109,9 @@ def verify(
     Raises:
         FileNotFoundError: ``source`` does not exist. Everything else that is wrong with it is among the
             ``problems``.
-        InputError: ``seed`` or ``num_threads`` is out of range.
+        InputError: ``seed`` or ``num_threads`` is out of range, or the files of a head alone have no id
+            of the tag ``embodiment``.
+        MissingExtraError: ``reference`` needs a package that is not installed.
 
     Example:
         >>> import saccade
@@ -134,13 +136,18 @@ def verify(
     found.version, found.layout = description.version, description.layout
     has_backbone = _check_tensors(found, published, description, path)
     say("values of the tensors")
-    not_finite = count_not_finite([Path(file.path) for file in description.files])
+    try:
+        not_finite = count_not_finite([Path(file.path) for file in description.files])
+    except SaccadeError as error:
+        found.problems += lines_of(error)
+        return found
     found.problems += [
         f"{name}: {count} of {of} values are NaN or infinite" for name, (count, of) in not_finite.items()
     ]
     found.robots = robots_of(path, description.config.num_states, data_config)
     if found.problems:
         return found
+    given = embodiment
     if embodiment is None:
         usable = [robot.embodiment for robot in found.robots if robot.problem is None]
         embodiment = usable[0] if usable and len(found.robots) > 1 else None
@@ -158,12 +165,17 @@ def verify(
             result = run_policy(path, options, seed, reference, say)
             found.part, found.robot, found.reference = "policy", result.robot, result.reference
             found.runs = result.runs
+        except MissingExtraError:
+            raise
         except (SaccadeError, FileNotFoundError) as error:
             found.refused = "; ".join(lines_of(error))
+    elif reference is not None:
+        found.refused = "the reference compares whole policies, and the checkpoint has no backbone"
     if not found.runs:
+        chosen = _head_embodiment(published, found.robots, given, has_backbone)
         try:
-            found.runs = run_head(path, embodiment, num_threads, seed, say)
-            found.part = "head"
+            found.runs = run_head(path, chosen, num_threads, seed, say)
+            found.part, found.robot = "head", str(chosen)
         except (SaccadeError, FileNotFoundError) as error:
             found.problems += lines_of(error)
     found.problems += [f"{run.name}: {run.problem}" for run in found.runs if run.problem is not None]
@@ -209,6 +221,22 @@ def _check_tensors(
     return backbone_prefix is not None
 
 
-def lines_of(error: BaseException) -> list[str]:
-    """The lines of a message: each names a problem."""
-    return [line.strip() for line in str(error).splitlines() if line.strip()]
+def _head_embodiment(
+    published: _saccade.HeadCheckpoint,
+    robots: list[RobotFindings],
+    given: str | int | None,
+    has_backbone: bool,
+) -> int:
+    """The id whose layers a head alone is run with: the given one, or else the first robot's that it has."""
+    if isinstance(given, int):
+        return given
+    ids = {one.embodiment: one.embodiment_id for one in robots if one.embodiment_id is not None}
+    if given is not None and given in ids:
+        return ids[given]
+    if given is not None and not has_backbone:  # with one, `refused` says what is wrong with the tag
+        raise InputError(
+            f"embodiment: the files of this head have no id of {given!r}, expected an id or one of "
+            f"{', '.join(tag for tag in ids if tag) or 'no tags'}"
+        )
+    kept = published.kept_embodiments() or [0]
+    return next((number for number in ids.values() if number in kept), kept[0])

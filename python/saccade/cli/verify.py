@@ -29,8 +29,9 @@ are refused. Then computes one chunk at each precision from the same random fram
 after another, and compares with float32. Without a backbone, or if the policy is refused, the head alone
 runs on random features. --reference, which needs the lab, also computes it in torch, in float32.
 
-What it prints is the text for the issue form "I ran it on a published checkpoint". It names no folder. Exit
-status: 0 passed; 1 something is wrong, or the whole policy was not run; 2 there is no such checkpoint.
+What it prints is the text for the issue form "I ran it on a published checkpoint". It names no folder above
+the checkpoint, and your home is ~; --json has whole paths. Exit status: 0 passed; 1 something is wrong, or
+the whole policy was not run; 2 there is no such checkpoint, or an argument is wrong.
 
 examples:
   saccade verify GR00T-N1.5-3B/ --data-config fourier_gr1_arms_only
@@ -106,12 +107,16 @@ def report(found: Verification) -> list[str]:
     ]
     lines += listed("tensors", [part(name, tensors) for name, tensors in found.tensors.items()])
     lines += listed("robots", [robot(one) for one in found.robots] or ["no statistics"])
-    ran = {"policy": f"the whole policy, as {found.robot}", "head": "the head alone, on random features"}
+    robot_of = "" if found.robot is None else f", as {found.robot}"
+    ran = {
+        "policy": f"the whole policy{robot_of}",
+        "head": f"the head alone, as embodiment {found.robot}, on random features",
+    }
     lines += listed("run", [ran[found.part] if found.part else "nothing"])
     if found.refused is not None:
         lines += listed("refused", [f"the whole policy: {found.refused}"])
     lines += ["", plain(table(found.runs)), ""] if found.runs else []
-    compared = ["not compared; --reference does, with the lab and torch"]
+    compared = ["not compared; --reference compares a whole policy, with the lab and torch"]
     if found.reference is not None:
         compared = [f"{key}: {value:.1e}" for key, value in found.reference.items()]
     lines += listed("reference", compared)
@@ -123,7 +128,7 @@ def report(found: Verification) -> list[str]:
 
 
 def without_folder(text: str, checkpoint: Path) -> str:
-    """A text that names files of a checkpoint by its own name, without the folders above it.
+    """A text that names files of a checkpoint by its own name, without the folders above it; home is ``~``.
 
     Example:
         >>> without_folder("/home/me/weights/policy/config.json: broken", Path("/home/me/weights/policy"))
@@ -131,8 +136,12 @@ def without_folder(text: str, checkpoint: Path) -> str:
     """
     for path in (checkpoint.resolve(), checkpoint):
         if path.parent != Path():
-            text = text.replace(f"{path.parent}{os.sep}", "")
-    return text
+            text = text.replace(str(path), path.name)
+    try:
+        home = Path.home()  # of other files, such as a tokenizer that was given
+    except RuntimeError:  # nobody's
+        return text
+    return text if home.parent == home else text.replace(f"{home}{os.sep}", f"~{os.sep}")
 
 
 def build_of(machine: dict[str, object]) -> str:
