@@ -135,11 +135,14 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("recordings", nargs="+", metavar="NAME=DIR")
     parser.add_argument("--out", type=Path, default=RECORD)
     args = parser.parse_args(arguments)
+    named = [(word, *word.partition("=")) for word in args.recordings]
+    for word, name, _, folder in named:
+        if not (name and folder):
+            parser.error(f"expected NAME=DIR, got {word!r}")
     here = machine.describe()
     require_commit(here, args.out)
     rows: list[Mapping[str, Any]] = []
-    for word in args.recordings:
-        name, _, folder = word.partition("=")
+    for _, name, _, folder in named:
         rows += [asdict(row) for row in count(name, Path(folder))]
     write_json(args.out, {"machine": here, "episodes_of_a_task": EPISODES, "rows": rows})
     print(table(rows))

@@ -55,6 +55,12 @@ def test_no_recording_is_named(tmp_path: Path) -> None:
         unchanged_views.count("x", tmp_path)
 
 
+def test_a_recording_without_a_name_is_bad_input(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        unchanged_views.main(["out/demos"])
+    assert "expected NAME=DIR, got 'out/demos'" in capsys.readouterr().err
+
+
 def test_the_page_shows_the_record() -> None:
     rows = json.loads(unchanged_views.RECORD.read_text())["rows"]
     page = (Path(unchanged_views.__file__).parents[1] / "docs" / "real-time.md").read_text()

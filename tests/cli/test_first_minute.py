@@ -107,6 +107,23 @@ def test_other_words_give_other_actions_without_the_expert(capsys: pytest.Captur
     ]
 
 
+def test_the_words_that_are_shown_are_those_that_were_given(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["demo", "--instruction", ""]) == 0
+    assert capsys.readouterr().out.startswith('push: ""\n')
+
+
+def test_a_narrow_terminal_shows_less(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for columns, expert, values in ((74, True, True), (73, False, True), (55, False, False)):
+        monkeypatch.setenv("COLUMNS", str(columns))
+        assert cli.main(["demo"]) == 0
+        lines = capsys.readouterr().out.splitlines()
+        assert max(map(len, lines[:-2])) <= columns
+        assert any("recorded expert" in line for line in lines) == expert
+        assert any("step 15" in line for line in lines) == values
+
+
 def test_an_unknown_task_is_named(capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["demo", "--task", "fly"]) == 2
     err = capsys.readouterr().err
@@ -176,6 +193,10 @@ def test_what_decides_about_colours(monkeypatch: pytest.MonkeyPatch) -> None:
     assert drawing.colours_of(Terminal("cp1252")) == "none"
     monkeypatch.setenv("COLORTERM", "")
     assert drawing.colours_of(Terminal()) == "256"
+    monkeypatch.setenv("TERM", "unknown")
+    assert drawing.colours_of(Terminal()) == "none"
+    monkeypatch.delenv("TERM")
+    assert drawing.colours_of(Terminal()) == "none"
     monkeypatch.setattr(sys, "platform", "win32")
     for understands, found in ((True, "true"), (False, "none")):
         monkeypatch.setattr(drawing, "_understands_escapes", lambda understands=understands: understands)

@@ -36,6 +36,8 @@ NUMBERS = ("hand x", "hand y", "hand z", "gripper")
 #: A view is drawn no wider than this.
 WIDEST = 40
 GAP = 2
+#: Columns that the actions take with the expert's beside them, and alone with some of their values.
+WITH_EXPERT, WITH_VALUES = 74, 56
 REPEATS = 5
 
 
@@ -59,17 +61,18 @@ def run(args: argparse.Namespace) -> int:
     started = time.perf_counter()
     policy = Policy.from_pretrained(demo_checkpoint())
     loaded = time.perf_counter() - started
-    observation = moment.observation(args.instruction)
+    instruction = moment.instruction if args.instruction is None else args.instruction
+    observation = moment.observation(instruction)
     seconds = []
     for _ in range(1 + REPEATS):  # the first call also allocates its memory
         started = time.perf_counter()
         found = policy.act(observation, seed=0)
         seconds.append(time.perf_counter() - started)
     actions = np.concatenate([found["hand"][0], found["gripper"][0]], axis=-1)
-    expert = moment.actions if args.instruction in (None, moment.instruction) else None
-    print(f'{moment.task}: "{args.instruction or moment.instruction}"')
+    expert = moment.actions if instruction == moment.instruction else None
+    print(f'{moment.task}: "{instruction}"')
     print("\n".join(views(moment)))
-    print("\n".join(chart(actions, expert)))
+    print("\n".join(chart(actions, expert, shutil.get_terminal_size().columns)))
     print(times(policy.head.num_threads, loaded, float(np.median(seconds[1:]))))
     print("Next: saccade act CHECKPOINT, saccade serve CHECKPOINT, saccade --help")
     return EXIT_OK
@@ -87,17 +90,22 @@ def views(moment: Moment) -> list[str]:
     return [gap.join(names).rstrip(), *drawing.beside(pictures, gap)]
 
 
-def chart(actions: Float32Array, expert: Float32Array | None) -> list[str]:
+def chart(actions: Float32Array, expert: Float32Array | None, columns: int) -> list[str]:
     """A line for each number of the actions ``(steps, 4)``: its course and some values, and the expert's.
 
-    ``expert`` is None if it was given other words than the policy.
+    ``expert`` is None if it was given other words than the policy. It is left out if ``columns`` are too few,
+    and so are the values where there are bars.
     """
     steps = len(actions)
     with_bars = drawing.can_write(sys.stdout, drawing.BARS)
-    shown = [0, steps // 3, 2 * steps // 3, steps - 1]
+    if columns < WITH_EXPERT:
+        expert = None
+    with_values = columns >= WITH_VALUES or not with_bars
+    shown = [0, steps // 3, 2 * steps // 3, steps - 1] if with_values else []
     ends = [0, steps - 1]
     head = "".join(f"{f'step {step}':>8}" for step in shown)
-    lines = [f"{f'{steps} actions, -1 to 1':<24}{head}{'' if expert is None else '  recorded expert'}"]
+    heading = f"{f'{steps} actions, -1 to 1':<24}{head}{'' if expert is None else '  recorded expert'}"
+    lines = [heading.rstrip()]
     for number, name in enumerate(NUMBERS):
         values = actions[:, number].tolist()
         course = drawing.bars(values, -1.0, 1.0) if with_bars else ""

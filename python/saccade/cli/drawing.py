@@ -29,10 +29,12 @@ RESET = "\x1b[0m"
 def colours_of(stream: TextIO) -> Colours:
     """The colours that a stream shows.
 
-    None if it is no terminal, if ``NO_COLOR`` is set, if ``TERM`` is ``dumb``, if its encoding has no half
-    blocks, or if it is a Windows console that does not understand escape sequences.
+    None if it is no terminal, if ``NO_COLOR`` is set, if ``TERM`` is ``dumb``, ``unknown`` or (except on
+    Windows) not set, if its encoding has no half blocks, or if it is a Windows console that does not
+    understand escape sequences.
     """
-    dumb = os.environ.get("NO_COLOR") or os.environ.get("TERM") == "dumb"
+    terminal = os.environ.get("TERM") or ("" if sys.platform == "win32" else "unknown")
+    dumb = os.environ.get("NO_COLOR") or terminal in ("dumb", "unknown")
     if dumb or not stream.isatty() or not can_write(stream, HALF_BLOCK):
         return "none"
     if sys.platform == "win32" and not _understands_escapes():

@@ -56,13 +56,16 @@ class CallProfile:
 
 
 def profile(policy: Policy, observation: Mapping[str, Any], seed: int, num_steps: int | None) -> CallProfile:
-    """The call of median length among repeated equal ones, after one that claims memory."""
+    """The fastest of repeated equal calls, after one that claims memory.
+
+    What other programs delay would count as crossing and copies: waiting for a processor is no arithmetic.
+    """
     one_call(policy, observation, seed, num_steps)
     calls: list[CallProfile] = []
     until = time.perf_counter() + SECONDS
     while len(calls) < CALLS or time.perf_counter() < until:
         calls.append(one_call(policy, observation, seed, num_steps))
-    return sorted(calls, key=lambda call: call.total)[len(calls) // 2]
+    return min(calls, key=lambda call: call.total)
 
 
 def one_call(policy: Policy, observation: Mapping[str, Any], seed: int, num_steps: int | None) -> CallProfile:
@@ -122,6 +125,6 @@ def tables(found: CallProfile) -> list[Section]:
         for part, spent in sorted(found.kernels.items(), key=lambda item: -item[1])
     ]
     return [
-        Section("A call, once memory is there", ["", ">ms", ">share", ""], rows),
+        Section("The fastest call, once memory is there", ["", ">ms", ">share", ""], rows),
         Section("Its arithmetic", ["", ">ms", ">share"], kernels),
     ]
