@@ -156,7 +156,10 @@ def test_velocity(error: type[Exception], message: str, options: dict[str, Any])
 @pytest.mark.parametrize(
     ("message", "options"),
     [
-        ("precision: expected one of 'float32', 'bfloat16', 'int8', got 'float8'", {"precision": "float8"}),
+        (
+            "precision: expected one of 'float32', 'bfloat16', 'int8', 'int4', got 'float8'",
+            {"precision": "float8"},
+        ),
         ("num_threads: expected at least 1, got 0", {"num_threads": 0}),
         ("num_threads: expected 1 to 1024, got 99999", {"num_threads": 99999}),
         ("num_threads: expected an integer, got 1.5", {"num_threads": 1.5}),
