@@ -10,7 +10,6 @@ use crate::gemm::elements::{F32, Int8, RoundedBf16, WidenedBf16};
 use crate::gemm::in_vectors::InVectors;
 #[cfg(all(target_arch = "aarch64", not(saccade_portable)))]
 use crate::gemm::neon::{DotprodInt8, I8mmInt8, Lanes, MatrixBf16, WideningInt8};
-use crate::gemm::nibbles::{Nibbles, OfInt8};
 use crate::gemm::{Gemm, available};
 #[allow(
     unused_imports,
@@ -63,7 +62,7 @@ macro_rules! of_vectors_unless {
 ///   `vectors`; with `where` a condition, where it holds: on Intel's Sapphire Rapids products of float32 have
 ///   twice the rate of those of bfloat16;
 /// - `gemm_bf16`, `gemm_int8`: products with packed weights of these elements, likewise; those after the last
-///   one listed are made of `vectors` alone; products of int4 are those of int8 by nibbles;
+///   one listed are made of `vectors` alone;
 /// - `needs`: of these types, the CPU must have at least one;
 /// - `gemm_f32`, `gemm_widened`: float32 rows with float32 weights, and with bfloat16 ones, where these
 ///   products are not made of `vectors` either; then no product is.
@@ -202,8 +201,6 @@ macro_rules! instruction_sets {
                             .or_else(|| of_vectors_unless!([$($gemm_f32)?] InVectors<$vectors, RoundedBf16>)),
                         (Arithmetic::Int8, _) => None $(.or_else(available::<$gemm_int8>))*
                             .or_else(|| of_vectors_unless!([$($gemm_f32)?] InVectors<$vectors, Int8>)),
-                        (Arithmetic::Int4, _) => None $(.or_else(available::<<$gemm_int8 as OfInt8>::OfNibbles>))*
-                            .or_else(|| of_vectors_unless!([$($gemm_f32)?] InVectors<$vectors, Nibbles<Int8>>)),
                     },)+
                     _ => None,
                 };

@@ -15,7 +15,7 @@ use super::elements::F32;
 use super::elements::{SumVector, Sums};
 use super::prefetch::{Lines, Parts};
 use super::step::{MicroKernel, RunsOn, Step};
-use super::{Block, MAX_NR, Shape};
+use super::{Block, Shape};
 #[cfg(feature = "peak")]
 use crate::simd::MAX_LANES;
 use crate::simd::bits::cast;
@@ -32,17 +32,6 @@ unsafe impl<S: Simd, E: Step<Broadcast>> RunsOn<S, Broadcast> for E {}
 /// with huge pages for the weights, AVX2 went from 0.85 to 0.89 of the FMA peak at 49 x 1536 x 6144 on Zen 4,
 /// AVX-512 from 0.94 to 0.95 (with one step a turn).
 const BLOCK_STEPS: usize = 1024;
-
-/// Steps of nibbles that are unpacked together: 24 kB of int8 in the widest vectors, which the nearest cache holds
-/// until all tiles of the block have taken them.
-const UNPACKED_STEPS: usize = 64;
-
-/// Words of as many steps.
-const MAX_UNPACKED: usize = 2 * MAX_NR * UNPACKED_STEPS;
-
-/// Where they are unpacked.
-#[repr(align(64))]
-struct Unpacked([MaybeUninit<u32>; MAX_UNPACKED]);
 
 // SAFETY: all rows of the block and all vectors of needed columns are written.
 unsafe impl MicroKernel for Broadcast {
@@ -104,14 +93,14 @@ unsafe impl MicroKernel for Broadcast {
 unsafe fn peak<S: Simd, E: Step<Broadcast>, const NV: usize, const MR: usize>(simd: S) -> usize {
     const STEPS: usize = 1 << 20;
     // Between 0.5 and 1 in float32 and bfloat16, positive in int8.
-    let (x, weights) = ([0x3f3f_3f3f_u32; 12], [0x3f3f_3f3f_u32; 6 * MAX_LANES]);
+    let (x, weights) = ([0x3f3f_3f3f_u32; 6], [0x3f3f_3f3f_u32; 3 * MAX_LANES]);
     let mut sums = [[E::Sums::zero(simd); NV]; MR];
     for _ in 0..STEPS {
         // Hidden, because products that do not change would be computed once.
         let (x, weights) = (black_box(x.as_ptr()), black_box(weights.as_ptr()));
         let rows = std::array::from_fn(|row| x.wrapping_add(row));
-        // SAFETY: there are two words for each of up to six rows, and two vectors of weights for each of up to
-        // three sums: more than one is there for nibbles, of which a step has two of int8.
+        // SAFETY: there is a word for each of up to six rows, and a vector of weights for each of up to three
+        // sums.
         unsafe { E::multiply_add::<S, NV, MR>(simd, &mut sums, &rows, 0, weights, 1) };
     }
     black_box(&sums);
@@ -147,26 +136,7 @@ unsafe fn panel_rows<S: Simd, E: Step<Broadcast>, const NV: usize, const UV: usi
         BLOCK_STEPS
     };
     let parts = Parts::new(block, step_words, steps, part_steps);
-    let mut unpacked = Unpacked([const { MaybeUninit::uninit() }; MAX_UNPACKED]);
-    let together = if E::HAS_NIBBLES {
-        UNPACKED_STEPS
-    } else {
-        BLOCK_STEPS
-    };
-    let ranges = parts.iter().flat_map(|part| {
-        // One that is empty as well: its sums are zero.
-        let count = part.len().div_ceil(together).max(1);
-        let first = move |index: usize| part.end.min(part.start + index * together);
-        (0..count).map(move |index| (part.clone(), first(index)..first(index + 1)))
-    });
-    for (part, range) in ranges {
-        let panel = &block.weights[range.start * step_words..range.end * step_words];
-        let weights = if E::HAS_NIBBLES {
-            E::unpack(simd, panel, step_words, &mut unpacked.0);
-            unpacked.0.as_ptr().cast()
-        } else {
-            panel.as_ptr()
-        };
+    for part in parts.iter() {
         for call in block.calls.clone() {
             let Range { start: row, end } = block.split.rows(&(call..call + 1));
             // SAFETY: the rows are in the block, their sums within the block's, and the part within the
@@ -174,34 +144,32 @@ unsafe fn panel_rows<S: Simd, E: Step<Broadcast>, const NV: usize, const UV: usi
             unsafe {
                 let tile = Tile {
                     row,
-                    weights,
                     sums: sums.add((row - first_row) * NV * S::LANES),
                     ahead: parts.lines(&part, call - block.calls.start),
-                    ahead_of: part.start,
                     is_one_of_few: block.calls.len() < NV,
                 };
                 match end - row {
-                    1 => tile_part::<S, E, NV, UV, 1>(simd, block, &range, &tile),
+                    1 => tile_part::<S, E, NV, UV, 1>(simd, block, &part, &tile),
                     2 if const { mr::<S, E>() >= 2 } => {
-                        tile_part::<S, E, NV, UV, 2>(simd, block, &range, &tile)
+                        tile_part::<S, E, NV, UV, 2>(simd, block, &part, &tile)
                     }
                     3 if const { mr::<S, E>() >= 3 } => {
-                        tile_part::<S, E, NV, UV, 3>(simd, block, &range, &tile)
+                        tile_part::<S, E, NV, UV, 3>(simd, block, &part, &tile)
                     }
                     4 if const { mr::<S, E>() >= 4 } => {
-                        tile_part::<S, E, NV, UV, 4>(simd, block, &range, &tile)
+                        tile_part::<S, E, NV, UV, 4>(simd, block, &part, &tile)
                     }
                     5 if const { mr::<S, E>() >= 5 } => {
-                        tile_part::<S, E, NV, UV, 5>(simd, block, &range, &tile)
+                        tile_part::<S, E, NV, UV, 5>(simd, block, &part, &tile)
                     }
                     6 if const { mr::<S, E>() >= 6 } => {
-                        tile_part::<S, E, NV, UV, 6>(simd, block, &range, &tile)
+                        tile_part::<S, E, NV, UV, 6>(simd, block, &part, &tile)
                     }
                     7 if const { mr::<S, E>() >= 7 } => {
-                        tile_part::<S, E, NV, UV, 7>(simd, block, &range, &tile)
+                        tile_part::<S, E, NV, UV, 7>(simd, block, &part, &tile)
                     }
                     8 if const { mr::<S, E>() >= 8 } => {
-                        tile_part::<S, E, NV, UV, 8>(simd, block, &range, &tile)
+                        tile_part::<S, E, NV, UV, 8>(simd, block, &part, &tile)
                     }
                     rows => unreachable!("a tile of {rows} rows"),
                 }
@@ -215,14 +183,11 @@ const fn mr<S: Simd, E: Step<Broadcast>>() -> usize {
     S::TILE_ROWS - E::FEWER_GROUPS
 }
 
-/// A tile of sums: its first row, the weights of the part, where its sums go, and what it prefetches from step
-/// `ahead_of` on.
+/// A tile of sums: its first row, where its sums go, and what it prefetches.
 struct Tile {
     row: usize,
-    weights: *const u32,
     sums: *mut u32,
     ahead: Lines,
-    ahead_of: usize,
     /// Of fewer tiles than a step has cache lines: each prefetches several.
     is_one_of_few: bool,
 }
@@ -230,7 +195,7 @@ struct Tile {
 /// `MR` rows by `UV` vectors of `NV` over one part of `k`.
 ///
 /// # Safety
-/// As [`panel_rows`]; the block has rows `tile.row .. tile.row + MR`, `tile.weights` the steps in `part`, and
+/// As [`panel_rows`]; the block has rows `tile.row .. tile.row + MR`, the panel the steps in `part`, and
 /// `tile.sums` room for the rows.
 #[inline(always)]
 unsafe fn tile_part<S: Simd, E: Step<Broadcast>, const NV: usize, const UV: usize, const MR: usize>(
@@ -240,7 +205,7 @@ unsafe fn tile_part<S: Simd, E: Step<Broadcast>, const NV: usize, const UV: usiz
     tile: &Tile,
 ) {
     const UNROLLED: usize = 4;
-    let row_elements = NV * S::LANES * if E::HAS_NIBBLES { 2 } else { 1 };
+    let row_elements = NV * S::LANES;
     // Loop and address arithmetic competes with the multiply-adds for execution ports on Intel: with one step
     // a turn 0.87 of the rate of the whole head with AVX2 in float32 and bfloat16 (Intel with AMX, two
     // threads). Eight gain no more. But without VNNI a product of int8 is three instructions, and four steps
@@ -268,7 +233,7 @@ unsafe fn tile_part<S: Simd, E: Step<Broadcast>, const NV: usize, const UV: usiz
             }
         }
     }
-    let weights = tile.weights;
+    let weights = block.weights.as_ptr();
     let mut first = part.start;
     loop {
         let end = part.end.min(first + E::Sums::PART / E::DEPTH);
@@ -285,7 +250,7 @@ unsafe fn tile_part<S: Simd, E: Step<Broadcast>, const NV: usize, const UV: usiz
                 // Memory works while the sums are made. Measured at 49 x 1536 x 6144 on Zen 4, in order,
                 // share of the FMA peak without and with it, with one step a turn: 0.89 and 0.95 (AVX-512),
                 // 0.69 and 0.85 (AVX2).
-                let (mut next, steps) = tile.ahead.at(step - tile.ahead_of);
+                let (mut next, steps) = tile.ahead.at(step - part.start);
                 // Hidden: compilers find the smaller of the two again in each step.
                 let round = step..black_box(whole.min(step + steps));
                 step = round.end;
@@ -295,12 +260,12 @@ unsafe fn tile_part<S: Simd, E: Step<Broadcast>, const NV: usize, const UV: usiz
                             simd.prefetch(next.wrapping_add(line * LINE).cast());
                         }
                         next = next.wrapping_add(tile.ahead.pitch);
-                        let words = weights.add((step - part.start) * row_elements);
+                        let words = weights.add(step * row_elements);
                         E::multiply_add(simd, &mut sums, &x, step, words, E::DEPTH);
                     }
                 } else {
                     let Range { mut start, end } = round;
-                    let mut words = weights.add((start - part.start) * row_elements);
+                    let mut words = weights.add(start * row_elements);
                     while start + unrolled <= end {
                         for index in 0..unrolled {
                             simd.prefetch(next.cast());
@@ -314,14 +279,14 @@ unsafe fn tile_part<S: Simd, E: Step<Broadcast>, const NV: usize, const UV: usiz
                     for step in start..end {
                         simd.prefetch(next.cast());
                         next = next.wrapping_add(tile.ahead.pitch);
-                        let words = weights.add((step - part.start) * row_elements);
+                        let words = weights.add(step * row_elements);
                         E::multiply_add(simd, &mut sums, &x, step, words, E::DEPTH);
                     }
                 }
             }
             if whole < end {
                 let rest = block.in_features - whole * E::DEPTH;
-                let words = weights.add((whole - part.start) * row_elements);
+                let words = weights.add(whole * row_elements);
                 E::multiply_add(simd, &mut sums, &x, whole, words, rest);
             }
             // Parts after the first read what the one before has written.

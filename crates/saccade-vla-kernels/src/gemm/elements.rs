@@ -1,10 +1,8 @@
 //! What rows, weights and sums are made of, and how they are stored.
 
-use std::mem::MaybeUninit;
-
 use super::{SUM_PART, odd_lines};
 use crate::simd::Simd;
-use crate::simd::bits::{Bits, cast, write_uninit};
+use crate::simd::bits::{Bits, cast};
 use crate::weights::Element;
 
 /// Elements of rows and of packed weights that are multiplied with each other.
@@ -25,10 +23,7 @@ pub(crate) trait Elements: Send + Sync + Sized + 'static {
         Element::F32 => 1,
         Element::Bf16 => 2,
         Element::Int8 => 4,
-        Element::Int4 => 8,
     };
-    /// Whether a word of a panel is two words of int8, a half of each byte in either.
-    const HAS_NIBBLES: bool = matches!(Self::WEIGHTS, Element::Int4);
 
     /// Whether bfloat16 weights are widened to be multiplied in float32.
     #[cfg(any(feature = "peak", all(target_arch = "aarch64", not(saccade_portable))))]
@@ -44,34 +39,6 @@ pub(crate) trait Elements: Send + Sync + Sized + 'static {
             RowElements::RoundedF32 => Some(odd_lines(in_features, 1)),
             RowElements::Bf16 => Some(odd_lines(in_features, 2)),
             RowElements::UnsignedBytes | RowElements::SignedBytes => Some(odd_lines(in_features, 4)),
-        }
-    }
-
-    /// Writes rows of a panel, of `row` words each, as twice as many rows of what is multiplied: bfloat16 widened,
-    /// or int8 of nibbles.
-    ///
-    /// # Panics
-    /// If `row` is not a number of whole vectors, or `to` has no room.
-    #[inline(always)]
-    fn unpack<S: Simd>(simd: S, panel: &[u32], row: usize, to: &mut [MaybeUninit<u32>]) {
-        for (words, to) in panel
-            .chunks_exact(row)
-            .zip(to[..2 * panel.len()].chunks_exact_mut(2 * row))
-        {
-            let (low, high) = to.split_at_mut(row);
-            let vectors = low
-                .chunks_exact_mut(S::LANES)
-                .zip(high.chunks_exact_mut(S::LANES));
-            for (words, (low, high)) in words.chunks_exact(S::LANES).zip(vectors) {
-                let words = simd.load_words(words);
-                if Self::HAS_NIBBLES {
-                    write_uninit(simd.low_nibbles(words), low);
-                    write_uninit(simd.high_nibbles(words), high);
-                } else {
-                    write_uninit(simd.low_halves(words), low);
-                    write_uninit(simd.high_halves(words), high);
-                }
-            }
         }
     }
 }

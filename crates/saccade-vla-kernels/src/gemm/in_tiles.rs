@@ -13,8 +13,8 @@ use super::prefetch::Parts;
 use super::{
     Block, Conversion, Finish, Gemm, MAX_MR, MAX_NR, MAX_ROW_BLOCK, PanelMut, ROW_BLOCK, Shape, pack,
 };
+use crate::simd::Simd;
 use crate::simd::bits::cast_slice_mut;
-use crate::simd::{Kernel, Simd};
 use crate::tiles::{Ahead, MAX_ROWS, Operation, Product, Session, TILE, TileUnit};
 use crate::weights::{Element, WeightRef};
 
@@ -24,7 +24,7 @@ const COLUMNS: usize = 3 * TILE;
 
 const _: () = assert!(COLUMNS <= MAX_NR && MAX_ROWS <= MAX_MR);
 
-/// Words of weights that one step multiplies.
+/// Words of a panel that one step meets.
 const STEP_WORDS: usize = TILE * COLUMNS;
 
 /// Steps of a part of a panel at most: 192 kB, and in as many steps a line of each of 48 streams of 4 kB.
@@ -47,16 +47,13 @@ impl<U: TileUnit, E: Elements> InTiles<U, E> {
     const NAME: &'static str = Joined::as_str(&Self::JOINED);
     const OPERATION: Operation = match E::WEIGHTS {
         Element::Bf16 => Operation::Bf16,
-        Element::Int8 | Element::Int4 => Operation::Int8,
+        Element::Int8 => Operation::Int8,
         Element::F32 => panic!("no tiles multiply float32"),
     };
 
-    /// Words of a panel for a step.
-    const PANEL_STEP: usize = STEP_WORDS * Self::OPERATION.per_word() / E::PER_WORD;
-
     /// Steps over which is summed.
     fn steps(in_features: usize) -> usize {
-        in_features.div_ceil(TILE * Self::OPERATION.per_word())
+        in_features.div_ceil(TILE * E::PER_WORD)
     }
 
     /// Prefetches where the results of some rows go: by the time that their sums are made, they are here.
@@ -96,7 +93,7 @@ unsafe impl<U: TileUnit, E: Elements> Gemm for InTiles<U, E> {
     }
 
     fn panel_words(&self, in_features: usize) -> usize {
-        Self::PANEL_STEP * Self::steps(in_features)
+        STEP_WORDS * Self::steps(in_features)
     }
 
     fn pack(&self, weight: WeightRef<'_>, first: usize, panel: PanelMut<'_>) {
@@ -126,7 +123,7 @@ unsafe impl<U: TileUnit, E: Elements> Gemm for InTiles<U, E> {
 
     fn multiply_and_finish(&self, block: &Block<'_>, sums: &mut [MaybeUninit<u32>], finish: Finish<'_>) {
         let steps = Self::steps(block.in_features);
-        block.check(self.shape(), Self::PANEL_STEP * steps, TILE * steps, sums);
+        block.check(self.shape(), STEP_WORDS * steps, TILE * steps, sums);
         let first_row = block.rows().start;
         if steps == 0 {
             sums[..block.rows().len() * COLUMNS].fill(MaybeUninit::new(0));
@@ -135,23 +132,10 @@ unsafe impl<U: TileUnit, E: Elements> Gemm for InTiles<U, E> {
         // Sums stay in their tiles over a part: on their way to memory and back they cost more than weights
         // that are read again from the second-level cache.
         let part_steps = steps.div_ceil(steps.div_ceil(PART_STEPS)).next_multiple_of(8);
-        let parts = Parts::new(block, Self::PANEL_STEP, steps, part_steps);
-        let mut unpacked = Unpacked([const { MaybeUninit::uninit() }; STEP_WORDS * PART_STEPS]);
+        let parts = Parts::new(block, STEP_WORDS, steps, part_steps);
         // SAFETY: no other session is open, and finishing uses no tiles.
         let mut session = unsafe { Session::new(self.unit) };
         for part in parts.iter() {
-            let panel = &block.weights[Self::PANEL_STEP * part.start..Self::PANEL_STEP * part.end];
-            let weights = if E::HAS_NIBBLES {
-                let (panel, to) = (panel, &mut unpacked.0);
-                self.unit.simd().run(&mut Unpack::<E> {
-                    panel,
-                    to,
-                    elements: PhantomData,
-                });
-                unpacked.0.as_ptr().cast()
-            } else {
-                panel.as_ptr()
-            };
             for call in block.calls.clone() {
                 let rows = block.split.rows(&(call..call + 1));
                 let is_last = part.end == steps;
@@ -164,7 +148,7 @@ unsafe impl<U: TileUnit, E: Elements> Gemm for InTiles<U, E> {
                     rows: rows.len(),
                     x: x.wrapping_add(rows.start * block.x.row_stride() + part.start * TILE),
                     x_stride: block.x.row_stride(),
-                    w: weights,
+                    w: block.weights[part.start * STEP_WORDS..].as_ptr(),
                     w_stride: COLUMNS,
                     w_column: TILE,
                     w_step: STEP_WORDS,
@@ -188,29 +172,7 @@ unsafe impl<U: TileUnit, E: Elements> Gemm for InTiles<U, E> {
     }
 
     fn multiply_outliers(&self, mut outliers: MultiplyOutliers<'_>) {
-        outliers.per_word = E::PER_WORD;
         self.unit.simd().run(&mut outliers);
-    }
-}
-
-/// The weights of a part, in the second-level cache, from which a call takes them as it takes those that are not
-/// unpacked.
-#[repr(align(64))]
-struct Unpacked([MaybeUninit<u32>; STEP_WORDS * PART_STEPS]);
-
-/// Unpacks a part of a panel.
-struct Unpack<'a, E> {
-    panel: &'a [u32],
-    to: &'a mut [MaybeUninit<u32>],
-    elements: PhantomData<E>,
-}
-
-impl<E: Elements> Kernel for Unpack<'_, E> {
-    type Output = ();
-
-    #[inline(always)]
-    fn run<S: Simd>(&mut self, simd: S) {
-        E::unpack(simd, self.panel, COLUMNS, self.to);
     }
 }
 

@@ -19,7 +19,7 @@ pub(crate) struct InVectors<S, E, L = super::broadcast::Broadcast> {
 
 impl<S: Simd, E: Step<L>, L: MicroKernel> InVectors<S, E, L> {
     const JOINED: Joined = match E::WEIGHTS {
-        Element::Int8 | Element::Int4 => join(S::NAME, S::DOT_NAME, E::NAME),
+        Element::Int8 => join(S::NAME, S::DOT_NAME, E::NAME),
         _ => join(S::NAME, "", E::NAME),
     };
     const NAME: &'static str = Joined::as_str(&Self::JOINED);
@@ -68,12 +68,8 @@ unsafe impl<S: Simd, E: RunsOn<S, L>, L: MicroKernel> Gemm for InVectors<S, E, L
     }
 
     fn multiply_outliers(&self, outliers: MultiplyOutliers<'_>) {
-        let (run, per_word) = (E::GROUP, E::PER_WORD);
-        self.simd.run(&mut MultiplyOutliers {
-            run,
-            per_word,
-            ..outliers
-        });
+        let run = E::GROUP;
+        self.simd.run(&mut MultiplyOutliers { run, ..outliers });
     }
 }
 

@@ -21,7 +21,6 @@ pub(crate) mod in_vectors;
 mod name;
 #[cfg(all(target_arch = "aarch64", not(saccade_portable)))]
 pub(crate) mod neon;
-pub(crate) mod nibbles;
 pub(crate) mod outliers;
 mod pack;
 #[cfg_attr(
@@ -90,9 +89,9 @@ unsafe impl Zeroable for Quantized {}
 pub(crate) struct PanelMut<'a> {
     /// [`Gemm::panel_words`] of them.
     pub words: &'a mut [u32],
-    /// What each column's sums are multiplied by, of int8 and int4; otherwise empty.
+    /// The scale of each column, of int8; otherwise empty.
     pub scales: &'a mut [f32],
-    /// The sum of each column's bytes, likewise.
+    /// The sum of each column's int8 weights, likewise.
     pub sums: &'a mut [i32],
 }
 
@@ -102,7 +101,7 @@ pub(crate) struct Conversion<'a> {
     pub x: Rows<'a>,
     /// A group in each row, [`Gemm::converted_stride`] words for each of its rows.
     pub words: RowsMut<'a, u32>,
-    /// How each row was quantised, of int8 and int4.
+    /// How each row was quantised, of int8.
     pub quantized: Option<RowsMut<'a, Quantized>>,
     /// The outliers of each row, if they are to be kept apart.
     pub outliers: Option<RowsMut<'a, Outliers>>,
@@ -201,7 +200,7 @@ impl Block<'_> {
 /// rows and panels, and makes results of the sums.
 ///
 /// An implementation sums each element in an order that depends on nothing but `in_features`: neither on the
-/// number of rows nor on where a row is. The sums are float32, and of int8 and int4 they are int32, of which
+/// number of rows nor on where a row is. The sums are float32, and of int8 they are int32, of which
 /// `scales[column] * quantized[row].scale * (sum - quantized[row].zero * sums[column])` is the product.
 ///
 /// # Safety
@@ -247,7 +246,7 @@ pub(crate) unsafe trait Gemm: PeakLoop + Send + Sync {
         finish(block.rows(), sums);
     }
 
-    /// Multiplies what was kept apart of rows by a panel of int8 or int4.
+    /// Multiplies what was kept apart of rows by a panel of int8.
     fn multiply_outliers(&self, outliers: MultiplyOutliers<'_>);
 }
 

@@ -90,15 +90,14 @@ fn ninth(row: &[f32], limit: f32) -> f32 {
     largest[MAX_OUTLIERS]
 }
 
-/// Multiplies the outliers of rows by a panel of bytes or of nibbles.
+/// Multiplies the outliers of rows by a panel of quads of int8.
 pub(crate) struct MultiplyOutliers<'a> {
     /// Of each row.
     pub outliers: &'a [Outliers],
     pub panel: &'a [u32],
     pub columns: usize,
-    /// Words of a column next to each other in the panel, and weights of a word.
+    /// Words of a column next to each other in the panel.
     pub run: usize,
-    pub per_word: usize,
     /// Rows of `columns` sums, zero at first.
     pub sums: &'a mut [f32],
 }
@@ -111,29 +110,25 @@ impl Kernel for MultiplyOutliers<'_> {
         let rows = self.outliers.iter().zip(self.sums.chunks_exact_mut(self.columns));
         for (outliers, sums) in rows.filter(|(outliers, _)| !outliers.is_empty()) {
             for (input, value) in outliers.iter() {
-                let (run, halves, word) = (self.run, self.per_word / 4, input / 4);
-                let words = &self.panel[word / run / halves * run * self.columns..][..run * self.columns];
-                // Of nibbles, words alternate: the low half of each byte, then the high one.
-                let is_low_half = halves > 1 && word / run % halves == 0;
-                let shift = 24 - 8 * (input % 4) as u32 + if is_low_half { 4 } else { 0 };
-                let mask = if halves > 1 { !15 } else { !0 };
+                let (run, word) = (self.run, input / 4);
+                let words = &self.panel[word / run * run * self.columns..][..run * self.columns];
+                let shift = 24 - 8 * (input % 4) as u32;
                 if run == 1 {
                     // Words next to each other: compilers make vectors of them.
-                    add(sums, words.iter(), shift, mask, value);
+                    add(sums, words.iter(), shift, value);
                 } else {
-                    add(sums, words[word % run..].iter().step_by(run), shift, mask, value);
+                    add(sums, words[word % run..].iter().step_by(run), shift, value);
                 }
             }
         }
     }
 }
 
-/// `sums += value * weight` for the weights that are the bits in `mask` of the byte of these words that ends `shift` bits below
-/// the top.
+/// `sums += value * weight` for the weights that are the byte of these words that ends `shift` bits below the top.
 #[inline(always)]
-fn add<'a>(sums: &mut [f32], words: impl Iterator<Item = &'a u32>, shift: u32, mask: i32, value: f32) {
+fn add<'a>(sums: &mut [f32], words: impl Iterator<Item = &'a u32>, shift: u32, value: f32) {
     for (sum, word) in sums.iter_mut().zip(words) {
-        let weight = (word << shift).cast_signed() >> 24 & mask;
+        let weight = (word << shift).cast_signed() >> 24;
         *sum += value * weight as f32;
     }
 }

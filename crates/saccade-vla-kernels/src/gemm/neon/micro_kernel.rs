@@ -33,22 +33,21 @@ const BLOCK_WORDS: usize = 12 << 10;
 /// Words of a vector.
 pub(super) const VECTOR: usize = 4;
 
-/// Words of weights that are unpacked at a time: those of a part of float32 sums.
-const MAX_UNPACKED: usize = SUM_PART * COLUMNS;
-
-/// Whether a word of a panel becomes two that are multiplied.
-const fn is_unpacked<E: Elements>() -> bool {
-    E::IS_WIDENED || E::HAS_NIBBLES
-}
+/// Words of weights that are widened at a time: the sums of a part.
+const MAX_WIDENED: usize = SUM_PART * COLUMNS;
 
 /// Words of a panel for a step.
 const fn panel_step<E: Step<Lanes>>() -> usize {
     COLUMNS * E::DEPTH / E::PER_WORD
 }
 
-/// Words that a step multiplies: twice as many where they are unpacked.
+/// Words that a step multiplies: more than that where weights are widened.
 const fn step_words<E: Step<Lanes>>() -> usize {
-    panel_step::<E>() * if is_unpacked::<E>() { 2 } else { 1 }
+    if E::IS_WIDENED {
+        COLUMNS * E::DEPTH
+    } else {
+        panel_step::<E>()
+    }
 }
 
 /// Groups of rows of the largest tile of these elements.
@@ -106,15 +105,15 @@ unsafe fn peak<S: Simd, E: Step<Lanes>, const NV: usize, const MR: usize>(simd: 
     const STEPS: usize = 1 << 17;
     // Between 0.5 and 1 in float32 and bfloat16, positive in int8.
     let (x, weights) = (
-        [0x3f3f_3f3f_u32; 2 * MAX_GROUPS * VECTOR],
-        [0x3f3f_3f3f_u32; 2 * VECTOR * COLUMNS],
+        [0x3f3f_3f3f_u32; MAX_GROUPS * VECTOR],
+        [0x3f3f_3f3f_u32; VECTOR * COLUMNS],
     );
     let mut sums = [[E::Sums::zero(simd); NV]; MR];
     for _ in 0..STEPS {
         // Hidden, because products that do not change would be computed once.
         let (x, weights) = (black_box(x.as_ptr()), black_box(weights.as_ptr()));
         let rows = std::array::from_fn(|group| x.wrapping_add(group * VECTOR));
-        // SAFETY: there are two vectors for each group, and as many words of weights as any step has.
+        // SAFETY: there is a vector for each group, and as many words of weights as any step has.
         unsafe { E::multiply_add::<S, NV, MR>(simd, &mut sums, &rows, 0, weights, E::DEPTH) };
     }
     black_box(&sums);
@@ -125,23 +124,20 @@ unsafe fn peak<S: Simd, E: Step<Lanes>, const NV: usize, const MR: usize>(simd: 
 /// As [`MicroKernel::multiply`]; `sums` has room for the rows of the block.
 #[inline(always)]
 unsafe fn panel_rows<S: Simd, E: Step<Lanes>, const NV: usize>(simd: S, block: &Block<'_>, sums: *mut u32) {
-    const { assert!(groups::<E>() >= 4 && S::LANES == VECTOR && step_words::<E>() <= 2 * VECTOR * COLUMNS) }
-    let mut unpacked = [const { MaybeUninit::<u32>::uninit() }; MAX_UNPACKED];
+    const { assert!(groups::<E>() >= 4 && S::LANES == VECTOR && step_words::<E>() <= VECTOR * COLUMNS) }
+    let mut widened = [const { MaybeUninit::<u32>::uninit() }; MAX_WIDENED];
     let first_row = block.rows().start;
     let steps = block.in_features.div_ceil(E::DEPTH);
-    let words = if is_unpacked::<E>() {
-        MAX_UNPACKED
+    let block_steps = if E::IS_WIDENED {
+        SUM_PART / E::DEPTH
     } else {
-        BLOCK_WORDS
+        BLOCK_WORDS / step_words::<E>()
     };
-    let block_steps = words / step_words::<E>();
     for part in 0..steps.div_ceil(block_steps).max(1) {
         let part = part * block_steps..steps.min((part + 1) * block_steps);
         let panel = &block.weights[part.start * panel_step::<E>()..part.end * panel_step::<E>()];
-        let weights = if is_unpacked::<E>() {
-            // In the tiles, widening would take an eighth of the time of their multiply-adds.
-            E::unpack(simd, panel, COLUMNS * E::GROUP, &mut unpacked);
-            unpacked.as_ptr().cast()
+        let weights = if E::IS_WIDENED {
+            widen(simd, panel, &mut widened)
         } else {
             panel.as_ptr()
         };
@@ -169,6 +165,25 @@ unsafe fn panel_rows<S: Simd, E: Step<Lanes>, const NV: usize>(simd: S, block: &
             }
         }
     }
+}
+
+/// The weights of a part in float32. Widening in the tiles would take an eighth of the time of their
+/// multiply-adds.
+#[inline(always)]
+fn widen<S: Simd>(simd: S, panel: &[u32], to: &mut [MaybeUninit<u32>]) -> *const u32 {
+    for (pairs, to) in panel.chunks_exact(COLUMNS).zip(to.chunks_exact_mut(2 * COLUMNS)) {
+        let (low, high) = to.split_at_mut(COLUMNS);
+        let vectors = low.chunks_exact_mut(VECTOR).zip(high.chunks_exact_mut(VECTOR));
+        for (words, (low, high)) in pairs.chunks_exact(VECTOR).zip(vectors) {
+            let words = simd.load_words(words);
+            // SAFETY: both have room for a vector.
+            unsafe {
+                simd.store_words_ptr(cast(simd.low_halves(words)), low.as_mut_ptr().cast());
+                simd.store_words_ptr(cast(simd.high_halves(words)), high.as_mut_ptr().cast());
+            }
+        }
+    }
+    to.as_ptr().cast()
 }
 
 /// A tile of sums: its rows, the weights of the part, where its sums go, and its number among those of the

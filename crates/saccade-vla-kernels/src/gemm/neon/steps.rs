@@ -6,7 +6,6 @@ use super::micro_kernel::{Lanes, VECTOR};
 use crate::gemm::elements::{
     Elements, F32, FloatSums, IntegerSums, RoundedBf16, RowElements, SumVector, WidenedBf16, elements,
 };
-use crate::gemm::nibbles::Nibbles;
 use crate::gemm::step::{RunsOn, Step};
 use crate::simd::Simd;
 use crate::simd::aarch64::instructions::{bfmmla, sdot_lane, usmmla};
@@ -40,8 +39,6 @@ unsafe impl RunsOn<Neon, Lanes> for WidenedBf16 {}
 unsafe impl RunsOn<Neon, Lanes> for RoundedBf16 {}
 // SAFETY: as of F32.
 unsafe impl RunsOn<Neon, Lanes> for WideningInt8 {}
-// SAFETY: a step is two of int8.
-unsafe impl<S, E: RunsOn<S, Lanes>> RunsOn<S, Lanes> for Nibbles<E> {}
 // SAFETY: the token proves `sdot`.
 unsafe impl RunsOn<NeonDotprod, Lanes> for DotprodInt8 {}
 // SAFETY: the token proves `usmmla`.
