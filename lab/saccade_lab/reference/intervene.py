@@ -459,7 +459,7 @@ def token_mask(name: str, given: Mask, tokens: Tensor) -> Tensor | None:
         DtypeError: The mask is not boolean.
         ShapeError: The mask has another shape.
     """
-    array = boolean(name, given)
+    array = boolean(name, given.cpu() if isinstance(given, Tensor) else given)
     if array is None:
         return None
     mask = torch.tensor(array, device=tokens.device)

@@ -122,7 +122,7 @@ class Learner(nn.Module):
                 noise=noise,
                 time=time,
                 action_mask=batch.mask,
-                drop_vl=~seen.attention_mask.cpu(),
+                drop_vl=~seen.attention_mask,
                 **self.masks(seen),
             )
         losses = {"loss": flow}
@@ -137,10 +137,10 @@ class Learner(nn.Module):
         return losses
 
     def masks(self, seen: BackboneFeatures) -> dict[str, Tensor]:
-        """The masks that alternating cross-attention takes, on the CPU; none for a head without it."""
+        """The masks that alternating cross-attention takes; none for a head without it."""
         if self.action_head.config.mask_mode == "none":
             return {}
-        return {"attention_mask": seen.attention_mask.cpu(), "image_mask": seen.image_mask.cpu()}
+        return {"attention_mask": seen.attention_mask, "image_mask": seen.image_mask}
 
     def seen(self, inputs: BackboneInputs | BackboneFeatures) -> BackboneFeatures:
         """The backbone's features of observations, unless that is what is given."""

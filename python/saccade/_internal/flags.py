@@ -306,6 +306,11 @@ def json_object(word: str) -> dict[str, Any]:
 
 def policy_options(args: argparse.Namespace) -> dict[str, Any]:
     """Keyword arguments of `saccade.Policy.from_pretrained`, from the flags declared above."""
-    names = ("embodiment", "preprocessing", "tokenizer", "data_config", "action_horizon", "processor_options")
     precision = {"backbone": args.precision, "head": args.head_precision or args.precision}
-    return {"precision": precision, **{name: getattr(args, name) for name in (*names, "num_threads")}}
+    return {"precision": precision, **loading_options(args)}
+
+
+def loading_options(args: argparse.Namespace) -> dict[str, Any]:
+    """Those of `policy_options` that do not depend on the precision."""
+    names = ("embodiment", "preprocessing", "tokenizer", "data_config", "action_horizon", "processor_options")
+    return {name: getattr(args, name) for name in (*names, "num_threads")}

@@ -5,6 +5,7 @@ One precision at a time is in memory.
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -212,10 +213,7 @@ def _check_tensors(
             part = "neither"
         counts = found.tensors.setdefault(part, Tensors())
         counts.count += 1
-        size = 1
-        for length in tensor.shape:
-            size *= length
-        counts.parameters += size
+        counts.parameters += math.prod(tensor.shape)
         counts.nbytes += tensor.nbytes
         counts.dtypes[tensor.dtype] = counts.dtypes.get(tensor.dtype, 0) + 1
     return backbone_prefix is not None

@@ -6,7 +6,7 @@ import argparse
 import dataclasses
 from typing import TYPE_CHECKING
 
-from saccade._internal.flags import UsageError
+from saccade._internal.flags import UsageError, loading_options
 from saccade.cli import EXIT_OK, output, require
 from saccade.cli.output import Section, show
 
@@ -34,13 +34,7 @@ def run(args: argparse.Namespace) -> int:
             args.precision_check,
             instruction=args.instruction,
             state=args.state,
-            embodiment=args.embodiment,
-            preprocessing=args.preprocessing,
-            tokenizer=args.tokenizer,
-            data_config=args.data_config,
-            action_horizon=args.action_horizon,
-            processor_options=args.processor_options,
-            num_threads=args.num_threads,
+            **loading_options(args),
             seed=args.seed or 0,
             progress=update,
         )

@@ -75,13 +75,7 @@ def run(args: argparse.Namespace) -> int:
 
     found = verify(
         args.checkpoint,
-        embodiment=args.embodiment,
-        preprocessing=args.preprocessing,
-        tokenizer=args.tokenizer,
-        data_config=args.data_config,
-        action_horizon=args.action_horizon,
-        processor_options=args.processor_options,
-        num_threads=args.num_threads,
+        **arguments.loading_options(args),
         seed=args.seed,
         reference=reference,
         progress=lambda text: output.note("verify", text),
