@@ -243,7 +243,8 @@ def rows_of(table: pd.DataFrame, policy: str, agrees: bool) -> Iterator[tuple[An
     """The episodes of every arm, in the order of their seeds."""
     part = table[(table["policy"] == policy) & (table["agrees"] == agrees)]
     for weight, without in ARMS:
-        arm = part[(part["weight"] == weight) & (part["without"].fillna("") == (without or ""))]
+        meaning = part["without"].isna() if without is None else part["without"] == without
+        arm = part[(part["weight"] == weight) & meaning]
         yield weight, without, arm.sort_values(["seed", "task"])
 
 
