@@ -127,7 +127,10 @@ def hourly(name: str, seconds: float) -> str:
 
 def main(arguments: list[str] | None = None) -> int:
     """Measures, writes the record and prints the tables."""
-    parser = argparse.ArgumentParser(prog="python -m benches.libero", description=__doc__)
+    raw = argparse.RawDescriptionHelpFormatter
+    parser = argparse.ArgumentParser(
+        prog="python -m benches.libero", description=__doc__, formatter_class=raw
+    )
     parser.add_argument("policy", type=Path)
     parser.add_argument("--large", type=Path, metavar="FOLDER")
     parser.add_argument("--out", type=Path, default=RECORD)
