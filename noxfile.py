@@ -342,7 +342,7 @@ def test_clients(session: nox.Session) -> None:
 
 @nox.session(name="test-ray")
 def test_ray(session: nox.Session) -> None:
-    """Test rollout, study and demos on a Ray cluster of two nodes on this machine, one of which dies.
+    """Test the commands that take `--backend ray` on a cluster of two nodes on this machine; one node dies.
 
     Ray is in no other environment, since it does not support every Python.
     """

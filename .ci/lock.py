@@ -32,7 +32,7 @@ FILES: dict[str, tuple[list[str], list[str]]] = {
     "nox": ([], ["nox"]),
     "core": (["saccade-vla"], ["build", "test"]),
     "rollout": (["saccade-vla-lab[sim]"], ["build"]),
-    "ray": (["saccade-vla-lab[ray]"], ["build", "test", "measured"]),
+    "ray": (["saccade-vla[data]", "saccade-vla-lab[ray]"], ["build", "test", "measured"]),
     "libero": (["saccade-vla[data]", "saccade-vla-lab[libero]"], ["build", "test"]),
     "peers": ([], ["peers"]),
     "lock": ([], ["lock"]),

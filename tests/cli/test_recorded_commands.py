@@ -285,8 +285,12 @@ def test_what_does_not_fit_is_one_line(
     for arguments, message in (
         (("--episodes", 7), "episodes: expected at least one of 0 to 2, got 7"),
         (("--stride", 99), "stride: expected at most 16"),
+        (("--jobs", 0), "--jobs: given 0, expected at least 1, or -1 for one per core"),
+        (("--address", "first:6379"), "--address: only with --backend ray, given loky"),
+        (("--certify", tmp_path), f"--certify: expected the name of a file, got the directory {tmp_path}"),
     ):
         assert run("evaluate", DEMO, folder, "--out", tmp_path / "out", *arguments) == 2
         assert message in capsys.readouterr().err
+        assert not (tmp_path / "out").exists()
     assert run("evaluate", DEMO, tmp_path / "nowhere", "--out", tmp_path / "out") == 2
     assert "nowhere" in capsys.readouterr().err

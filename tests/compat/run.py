@@ -68,11 +68,12 @@ RELEASES = (
 )
 
 INTRODUCTION = """\
-# What `accelerate` was tested with
+# What was tested with releases of lerobot
 
-The tests use lerobot's own policy, model, backbone and head, small and with random weights. Where only the
-head is accelerated, the backbone is a stub. `make test-compat` creates an environment for each release, runs
-the tests in it and writes this page. Errors compare whole chunks with the original `get_action` for equal
+`make test-compat` creates an environment for each release, runs the tests of `accelerate`, of the plugin and
+of data sets in it, and writes this page. The table is that of `accelerate`. Its tests use lerobot's own
+policy, model, backbone and head, small and with random weights. Where only the head is accelerated, the
+backbone is a stub. Errors compare whole chunks with the original `get_action` for equal
 seeds: the root-mean-square difference divided by the root mean square of the actions, and of that the largest
 over the tests. In float32 the differences come from the order of sums and from torch's own sine tables. Where
 the original rounds to bfloat16, the difference is its rounding.

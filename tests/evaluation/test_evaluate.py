@@ -199,6 +199,23 @@ def test_two_evaluations_are_compared_chunk_by_chunk(data: Recorded, report: Eva
     found = coarse.compare(report)
     assert not found.equal
     assert found.mse.value == pytest.approx(coarse.mse - report.mse, rel=1e-4)
+    for key, one in found.mse_by_key.items():
+        assert one.value == pytest.approx(coarse.by_key[key].mse - report.by_key[key].mse, rel=1e-4)
+        # The interval is that of differences within episodes: with three, of the smallest and the largest.
+        where = report.layout.keys[key]
+        errors = []
+        for run in (coarse, report):
+            paths = [
+                done.predicted[:, 0, :4].reshape(-1, 4)[: len(done.recorded)] for done in run.predictions
+            ]
+            errors.append(
+                [
+                    np.mean((path - done.recorded)[:, where] ** 2)
+                    for path, done in zip(paths, run.predictions, strict=True)
+                ]
+            )
+        apart = np.asarray(errors[0], np.float64) - np.asarray(errors[1], np.float64)
+        assert (one.low, one.high) == pytest.approx((apart.min(), apart.max()), rel=1e-5)
     for other in (
         saccade.evaluate(demo_policy(), data, stride=4, seed=1),
         saccade.evaluate(demo_policy(), data, stride=5),

@@ -86,11 +86,15 @@ def extension(name: str) -> Callable[..., Any] | None:
 
 
 def check_processes(args: argparse.Namespace) -> None:
-    """Checks that the lab is installed if other processes are wanted.
+    """Checks the processes that are wanted, and that the lab is installed if they are others than this one.
 
     Raises:
-        UsageError: It is not; the message says how to install it.
+        UsageError: A flag is out of range, or the lab is missing; the message says how to install it.
     """
+    if args.jobs is not None and args.jobs < 1 and args.jobs != -1:
+        raise UsageError(f"--jobs: given {args.jobs}, expected at least 1, or -1 for one per core")
+    if args.address is not None and args.backend != "ray":
+        raise UsageError(f"--address: only with --backend ray, given {args.backend}")
     if is_spread(args) and extension("spread") is None:
         raise UsageError(
             f"--jobs, --backend: need {LAB}, which is not installed. Install with: "

@@ -4,6 +4,7 @@
 - ``measures``: errors and baselines; ``report``: all of them; ``open_loop``: the function.
 - ``certificate``: a record that another machine can check.
 - ``source``, ``work``, ``episode_files``: what the commands need to go on where a run stopped.
+- ``pairing``: what two runs must share to be compared chunk by chunk.
 """
 
 from saccade._internal.bootstrap import Estimate

@@ -41,7 +41,7 @@ class EpisodeFiles(Generic[Record]):
         """
         now = json.loads(dumps(settings))
         file = self.folder / SETTINGS
-        if file.is_file():
+        if self.is_begun():
             before = self.settings()
             names = [name for name in {**before, **now} if before.get(name) != now.get(name)]
             if names:
@@ -54,6 +54,10 @@ class EpisodeFiles(Generic[Record]):
             raise InputError(f"{file}: no such file, but results of episodes beside it: delete {self.folder}")
         self.folder.mkdir(parents=True, exist_ok=True)
         write_json(file, now)
+
+    def is_begun(self) -> bool:
+        """Whether the directory has settings of a run."""
+        return (self.folder / SETTINGS).is_file()
 
     def settings(self) -> dict[str, Any]:
         """The settings of the results.

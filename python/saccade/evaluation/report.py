@@ -28,6 +28,7 @@ class Comparison:
 
     Attributes:
         mse, mae: The first's error minus the other's, with its 95 % interval over episodes.
+        mse_by_key: The same of the mean squared error of each key of the action.
         largest, mean: The largest and the mean absolute difference of their actions, by key, in the robot's
             units.
         equal: Whether all actions are equal, bit for bit.
@@ -35,6 +36,7 @@ class Comparison:
 
     mse: Estimate
     mae: Estimate
+    mse_by_key: Mapping[str, Estimate]
     largest: Mapping[str, float]
     mean: Mapping[str, float]
     equal: bool
@@ -116,21 +118,7 @@ class Evaluation:
                 "compare: expected evaluations of the same episodes, with the same stride, horizon, seed and "
                 f"keys, got {self} and {other}"
             )
-        differences = [
-            [
-                np.subtract(one, two, dtype=np.float64)
-                for one, two in zip(
-                    episode_errors(first, self.stride, self.layout).all[:2],
-                    episode_errors(second, self.stride, self.layout).all[:2],
-                    strict=True,
-                )
-            ]
-            for first, second in pairs
-        ]
-        mse, mae = (
-            bootstrap_ratio(column, np.ones(len(pairs)), range(len(pairs)))
-            for column in zip(*differences, strict=True)
-        )
+        errors = [[episode_errors(one, self.stride, self.layout) for one in pair] for pair in pairs]
         apart = np.concatenate(
             [
                 np.abs(executed(one, self.stride).astype(np.float64) - executed(two, self.stride))
@@ -138,8 +126,12 @@ class Evaluation:
             ]
         )
         return Comparison(
-            mse=mse,
-            mae=mae,
+            mse=_difference([(one.all[0], two.all[0]) for one, two in errors]),
+            mae=_difference([(one.all[1], two.all[1]) for one, two in errors]),
+            mse_by_key={
+                key: _difference([(one.by_key[key][0], two.by_key[key][0]) for one, two in errors])
+                for key in self.layout.keys
+            },
             largest={key: float(apart[:, where].max()) for key, where in self.layout.keys.items()},
             mean={key: float(apart[:, where].mean()) for key, where in self.layout.keys.items()},
             equal=all(np.array_equal(one.predicted[:, 0], two.predicted[:, 0]) for one, two in pairs),
@@ -170,6 +162,12 @@ class Evaluation:
             f"<saccade.Evaluation mse={self.mse:.6g} mae={self.mae:.6g} episodes={len(self.predictions)} "
             f"stride={self.stride} horizon={self.horizon} seed={self.seed}>"
         )
+
+
+def _difference(pairs: Sequence[tuple[Any, Any]]) -> Estimate:
+    """The mean over episodes of the first number minus the second, with its interval."""
+    found = [np.subtract(one, two, dtype=np.float64) for one, two in pairs]
+    return bootstrap_ratio(found, np.ones(len(found)), range(len(found)))
 
 
 def summarised(predictions: Sequence[Predicted], layout: Layout, stride: int, seed: int) -> Evaluation:

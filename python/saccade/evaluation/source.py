@@ -73,16 +73,20 @@ class Source:
         return _data(self.recordings).for_policy(self.policy)
 
     def identity(self) -> dict[str, Any]:
-        """What decides the actions: hashes, options, and what computes."""
+        """What decides the actions: recordings, and all of :meth:`checkpoint_identity`."""
+        recordings = {
+            "name": Path(self.recordings).name,
+            "sha256": _data(self.recordings).fingerprint(),
+        }
+        return {**self.checkpoint_identity(), "recordings": recordings}
+
+    def checkpoint_identity(self) -> dict[str, Any]:
+        """What decides the actions besides the recordings: hashes, options, and what computes."""
         config = show_config("dicts")
         return {
             "checkpoint": {
                 "name": Path(self.checkpoint).resolve().name,
                 "sha256": weights_hash(self.checkpoint),
-            },
-            "recordings": {
-                "name": Path(self.recordings).name,
-                "sha256": _data(self.recordings).fingerprint(),
             },
             "options": {name: value for name, value in self.options.items() if name != "num_threads"},
             "option_files": {
@@ -95,9 +99,16 @@ class Source:
         }
 
 
-@functools.lru_cache(maxsize=1)
+#: The policy that this process has loaded, by checkpoint and options.
+_loaded: dict[tuple[str, str], Policy] = {}
+
+
 def _policy(checkpoint: str, options: str) -> Policy:
-    return Policy.from_pretrained(checkpoint, **json.loads(options))
+    found = _loaded.get((checkpoint, options))
+    if found is None:
+        forget_policy()
+        found = _loaded[checkpoint, options] = Policy.from_pretrained(checkpoint, **json.loads(options))
+    return found
 
 
 @functools.lru_cache(maxsize=1)
@@ -107,7 +118,7 @@ def _data(recordings: str) -> Dataset:
 
 def forget_policy() -> None:
     """Drops the policy that this process has loaded, so that another one finds its memory free."""
-    _policy.cache_clear()
+    _loaded.clear()
 
 
 def weights_hash(checkpoint: str | Path) -> str:

@@ -13,6 +13,7 @@ import os
 import signal
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -20,16 +21,22 @@ import pandas as pd
 import pytest
 
 import saccade
-from saccade.cli import main
+from saccade.cli import main, recorded
 from saccade.errors import InputError
+from saccade.evaluation.source import weights_hash
 from saccade_lab.cli import rollout
+from saccade_lab.libero.episodes import Episodes
 from saccade_lab.parallel import ALONE, Lost, Workers, each
+from saccade_lab.recordings.spreading import spread
 from saccade_lab.sim import demos, graphics
 from saccade_lab.sim.policy import DEMO_CHECKPOINT
 from saccade_lab.study.cell import Cell, Rows
 from saccade_lab.study.run import StudyError, run_cells
+from tests.helpers.libero_runs import checkpoint
 from tests.helpers.parallel_cases import Reads, Square
 from tests.helpers.paths import ROOT
+from tests.helpers.recorded_cases import made_up
+from tests.helpers.recorded_folder import written
 
 if importlib.util.find_spec("ray") is None and "SACCADE_RAY" not in os.environ:
     pytest.skip("the extra ray is not installed; run make test-ray", allow_module_level=True)
@@ -163,12 +170,12 @@ def test_a_study_that_loses_a_process_and_a_node_has_the_table_of_one_process(
 def test_a_rollout_that_loses_a_process_and_a_node_has_the_episodes_of_one_process(
     nodes: TwoNodes, tmp_path: Path
 ) -> None:
-    from saccade_lab.sim.episodes import Episodes
+    from saccade_lab.sim.episodes import Episodes as Simulated
 
     outcomes = []
     for name, workers in (("one", ALONE), ("two", nodes.workers)):
         (tmp_path / name).mkdir()
-        episodes = Episodes(str(DEMO_CHECKPOINT), num_threads=1)
+        episodes = Simulated(str(DEMO_CHECKPOINT), num_threads=1)
         session = rollout.Session(
             episodes, ["reach", "button-press-topdown"], range(5), workers, tmp_path / name
         )
@@ -265,7 +272,9 @@ def test_commands_take_an_address(
     ray = ["--backend", "ray", "--address", nodes.cluster.address]
     few = ["--tasks", "button-press-topdown", "--episodes", "2"]
     out = ["--out", str(tmp_path / "out")]
-    assert main(["rollout", *few, *ray, "--video", *out]) == 0
+    assert main(["rollout", *few, *ray, "--video", "--record", str(tmp_path / "rolled"), *out]) == 0
+    rolled = saccade.datasets.open(tmp_path / "rolled")
+    assert [rolled.column(episode, "noise_seed")[0, 1] for episode in range(len(rolled))] == [0, 1]
     results = json.loads((tmp_path / "out" / "results.json").read_text())
     assert [episode["seed"] for episode in results["episodes"]] == [0, 1]
     assert results["complete"] is True
@@ -275,7 +284,65 @@ def test_commands_take_an_address(
     assert len(pd.read_csv(tmp_path / "out" / "cuts.csv")) == 2
     assert main(["demos", *few, "--image-size", "16", *ray, *out]) == 0
     assert len(list((tmp_path / "out" / "button-press-topdown").glob("*.npz"))) == 2
+    shown = [tmp_path / name for name in ("alone", "on two nodes")]
+    for folder, workers in zip(shown, ([], ray), strict=True):
+        assert main(["demos", *few, "--image-size", "16", "--record", str(folder), *workers]) == 0
+    assert len({saccade.datasets.open(folder).fingerprint() for folder in shown}) == 1
     capsys.readouterr()
+
+
+@pytest.mark.parametrize("command", ["evaluate", "diagnose"])
+def test_recordings_on_the_cluster_give_the_results_of_one_process(
+    command: str,
+    nodes: TwoNodes,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setattr(recorded, "extension", {"spread": spread}.get)  # pages have tests of their own
+    folder, policy = written(made_up((9, 5, 8, 7, 6)), tmp_path / "tiny"), str(DEMO_CHECKPOINT)
+    options = ["--num-threads", "1"]
+    if command == "evaluate":
+        options += ["--stride", "8", "--num-steps", "2", "--against", policy]
+    found = []
+    for name, workers in (
+        ("one", []),
+        ("two", ["--backend", "ray", "--address", nodes.cluster.address]),
+    ):
+        out = tmp_path / name
+        assert main([command, policy, str(folder), "--out", str(out), *options, *workers]) == 0
+        results = json.loads((out / "results.json").read_text())
+        for part in (results, (results.get("against") or {}).get("other", {})):
+            part["seconds"] = 0
+        found.append(results)
+    assert found[0] == found[1]
+    assert len(found[0]["episodes"]) == 5
+    capsys.readouterr()
+
+
+@dataclass(frozen=True)
+class LoadsLibero:
+    """Says where the policy of `saccade libero` was loaded from. LIBERO is in no environment with Ray."""
+
+    episodes: Episodes
+
+    def __call__(self, number: int) -> tuple[str, str, str]:
+        time.sleep(0.1)
+        assert self.episodes.policy.protocol.name == "isaac-n17"
+        path = self.episodes.checkpoint
+        return path, weights_hash(path), os.environ["TMPDIR"]
+
+
+def test_the_policy_of_libero_is_brought_to_each_node(nodes: TwoNodes) -> None:
+    path = str(checkpoint("n1.7"))
+    work = LoadsLibero(Episodes(path, "auto", {"num_threads": 1}))
+    found = [result for _, result in each(work, range(8), nodes.workers, [path])]
+    for result in found:
+        assert not isinstance(result, Lost)
+        place, sha256, folder = result
+        assert Path(place).is_relative_to(folder)
+        assert sha256 == weights_hash(path)
+    assert len({result[2] for result in found if not isinstance(result, Lost)}) == 2
 
 
 def test_no_cluster_is_one_line(

@@ -14,6 +14,7 @@ from selenium import webdriver
 from selenium.webdriver.chrome.service import Service
 
 import saccade
+from saccade.cli.against import beside
 from saccade.evaluation import Evaluation
 from saccade_lab.recordings import pages
 from tests.helpers.recorded_cases import Recorded, demo_policy, made_up, still
@@ -45,7 +46,14 @@ def report(data: Recorded) -> Evaluation:
 @pytest.fixture(scope="module")
 def written(data: Recorded, report: Evaluation, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     found = {name: tmp_path_factory.mktemp(name) for name in ("evaluation", "diagnosis")}
-    against = report.compare(saccade.evaluate(demo_policy(), data, stride=4, num_steps=1)).to_json()
+    other = saccade.evaluate(demo_policy(), data, stride=4, num_steps=1)
+    settings = {
+        **ABOUT,
+        "checkpoint": {"name": "<base>", "sha256": "2" * 64},
+        "options": {"precision": "float32"},
+        "sampling": {"num_steps": 1},
+    }
+    against = beside(report.compare(other), other, settings)
     pages.evaluation_page(report, {**ABOUT, "against": against}, found["evaluation"])
     short = made_up((2, 1, 2, 1, 2))
     pages.diagnosis_page(
@@ -72,11 +80,23 @@ def test_a_page_refers_to_nothing(name: str, written: dict[str, Path]) -> None:
     assert "nan" not in re.sub(r"<[^>]*>", "", text).lower()
 
 
-def test_the_evaluations_page_has_its_numbers(written: dict[str, Path], report: Evaluation) -> None:
+def test_the_evaluations_page_has_its_numbers(
+    data: Recorded, written: dict[str, Path], report: Evaluation
+) -> None:
     text = (written["evaluation"] / "index.html").read_text(encoding="utf-8")
     for one in (report.errors, *report.by_key.values(), *report.baselines.values()):
         assert f"{one.mse:.6g}" in text
-    assert "Against the earlier run" in text
+    assert "<h2>Against &lt;base&gt;, float32, num_steps 1</h2>" in text
+    other = saccade.evaluate(demo_policy(), data, stride=4, num_steps=1)
+    found = report.compare(other)
+    for name, own, theirs, apart in (
+        ("MSE", report.mse, other.mse, found.mse),
+        ("– hand", report.by_key["hand"].mse, other.by_key["hand"].mse, found.mse_by_key["hand"]),
+        ("MAE", report.mae, other.mae, found.mae),
+    ):
+        row = "".join(f'<td class="n">{number:.6g}</td>' for number in (own, theirs, apart.value))
+        interval = f'<td class="n">{apart.low:.4g} to {apart.high:.4g}</td>'
+        assert f"<tr><td>{name}</td>{row}{interval}</tr>" in text
     curves = sorted((written["evaluation"] / "curves").glob("*.png"))
     assert [path.stem for path in curves] == [f"{episode:06d}" for episode in range(len(LENGTHS))]
     with Image.open(curves[0]) as picture:

@@ -1,0 +1,157 @@
+"""`saccade evaluate --against`: an earlier run, or another checkpoint that is run beside this one."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+from saccade.cli import describe, output, recorded
+from saccade.cli.output import Section
+from saccade.errors import InputError, SaccadeError
+
+if TYPE_CHECKING:
+    from saccade._internal.bootstrap import Estimate
+    from saccade.evaluation.episode_files import EpisodeFiles
+    from saccade.evaluation.prediction import Predicted
+    from saccade.evaluation.report import Comparison, Evaluation
+    from saccade.evaluation.work import PredictEpisode
+
+#: Where in DIR the episodes of the other checkpoint are. It is itself the directory of a run.
+FOLDER = "against"
+#: How it is loaded, whatever the precision of this run.
+EXACT = {"backbone": "float32", "head": "float32"}
+
+
+@dataclass(frozen=True)
+class Against:
+    """What a run is compared with.
+
+    Attributes:
+        settings: Its settings.
+        files: Its episodes.
+        work: What computes them; None for an earlier run, which has them all.
+    """
+
+    settings: Mapping[str, Any]
+    files: EpisodeFiles[Predicted]
+    work: PredictEpisode | None
+
+    def begin(self) -> None:
+        """Writes the settings, or checks that the directory has results of the same settings.
+
+        Raises:
+            InputError: It has results of others.
+        """
+        if self.work is not None:
+            self.files.begin(self.settings)
+
+    def predictions(self, episodes: Sequence[int], args: argparse.Namespace) -> list[Predicted]:
+        """The episodes, those that are missing computed now."""
+        if self.work is None:
+            return [one for one in map(self.files.load, episodes) if one is not None]
+        return recorded.computed(self.work, episodes, self.files, args, self.work.source, "against")
+
+
+def chosen(
+    args: argparse.Namespace, work: PredictEpisode, settings: Mapping[str, Any], episodes: Sequence[int]
+) -> Against:
+    """What ``--against`` names, checked before anything is computed.
+
+    Args:
+        args: The arguments of the command.
+        work: What computes an episode of this run.
+        settings: The settings of this run.
+        episodes: Its episodes.
+
+    Raises:
+        FileNotFoundError: There is neither a checkpoint nor a run.
+        InputError: The chunks would be no pairs, or an earlier run lacks an episode.
+    """
+    from saccade.evaluation.episode_files import EpisodeFiles
+    from saccade.evaluation.prediction import Predicted
+
+    files = EpisodeFiles(args.against, Predicted)
+    return _earlier(files, settings, episodes) if files.is_begun() else _checkpoint(args, work, settings)
+
+
+def _earlier(files: EpisodeFiles[Predicted], settings: Mapping[str, Any], episodes: Sequence[int]) -> Against:
+    """An earlier run."""
+    from saccade.evaluation.pairing import check_shared
+
+    where, about = f"--against: {files.folder.parent}", files.settings()
+    check_shared(about, settings, where)
+    missing = [str(episode) for episode in episodes if files.load(episode) is None]
+    if missing:
+        raise InputError(
+            f"{where}: expected the episodes of this run, {', '.join(missing)} "
+            f"{'is' if len(missing) == 1 else 'are'} missing"
+        )
+    return Against(about, files, None)
+
+
+def _checkpoint(args: argparse.Namespace, work: PredictEpisode, settings: Mapping[str, Any]) -> Against:
+    """A checkpoint, loaded as this run's, but exact: in float32, with the sampler of its config."""
+    from saccade.evaluation.episode_files import EpisodeFiles
+    from saccade.evaluation.pairing import check_shared, interface_of
+    from saccade.evaluation.prediction import Predicted
+    from saccade.evaluation.source import Source
+
+    where = f"--against: {args.against}"
+    try:
+        source = Source.of(args.against, work.source.recordings, {**work.source.options, "precision": EXACT})
+        with output.progress_bar("loading", transient=True):
+            about = {**settings, **source.checkpoint_identity(), "sampling": {}}
+            about |= interface_of(source.policy)
+    except (SaccadeError, FileNotFoundError, PermissionError) as error:
+        raise InputError(
+            f"{where}: expected the directory of an earlier run, or a checkpoint: {describe(error)}"
+        ) from None
+    check_shared(about, settings, where)
+    if about == settings:
+        raise InputError(
+            f"{where}: expected another checkpoint, precision or sampling than that of this run, got the same"
+        )
+    other = replace(work, source=source, sampling={})
+    return Against(about, EpisodeFiles(args.out / FOLDER, Predicted), other)
+
+
+def beside(comparison: Comparison, other: Evaluation, settings: Mapping[str, Any]) -> dict[str, Any]:
+    """What results.json has of a comparison: the differences, and the errors of the other."""
+    from saccade.evaluation.pairing import described
+
+    names = ("checkpoint", "options", "sampling", "saccade", "instruction_set")
+    return {
+        **comparison.to_json(),
+        "name": described(settings),
+        "other": {
+            **{name: settings[name] for name in names},
+            **asdict(other.errors),
+            "by_key": {key: asdict(one) for key, one in other.by_key.items()},
+            "seconds": other.seconds,
+        },
+    }
+
+
+def sections(report: Evaluation, comparison: Comparison, other: Evaluation, name: str) -> list[Section]:
+    """Both errors beside each other with their paired difference, and how far the actions are apart."""
+    rows = [
+        _row("MSE", report.mse, other.mse, comparison.mse),
+        *(
+            _row(f"  {key}", report.by_key[key].mse, other.by_key[key].mse, one)
+            for key, one in comparison.mse_by_key.items()
+        ),
+        _row("MAE", report.mae, other.mae, comparison.mae),
+    ]
+    head = ["", ">this run", ">the other", ">difference", ">95 %"]
+    apart = [[key, f"{mean:.6g}", f"{comparison.largest[key]:.6g}"] for key, mean in comparison.mean.items()]
+    return [
+        Section(f"Against {name}, on the same observations and noise", head, rows),
+        Section("Actions of both apart, in the robot's units", ["", ">mean", ">largest"], apart),
+    ]
+
+
+def _row(name: str, own: float, other: float, difference: Estimate) -> list[str]:
+    low, high = f"{difference.low:.4g}", f"{difference.high:.4g}"
+    return [name, f"{own:.6g}", f"{other:.6g}", f"{difference.value:.6g}", f"{low} to {high}"]

@@ -1,0 +1,90 @@
+"""What two runs must share, so that their chunks are pairs: the same observation, noise and numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+from saccade.errors import InputError
+from saccade.evaluation.prediction import horizon_of
+
+if TYPE_CHECKING:
+    from saccade.policy.policy import Policy
+
+#: Settings of a run that must be equal, in the order in which a difference is named.
+SHARED = ("command", "recordings", "observation", "action_keys", "horizon", "noise_shape", "stride", "seed")
+
+
+def interface_of(policy: Policy) -> dict[str, Any]:
+    """What a policy is shown and what it answers, as JSON values.
+
+    Returns:
+        ``observation``: the cameras, the keys of the state, and their steps relative to now; ``action_keys``:
+        key and number of values of each part, in order; ``horizon``: actions in a chunk; ``noise_shape``:
+        that of the head's noise, ``[horizon, width]``.
+
+    Raises:
+        InputError: As :func:`saccade.evaluation.prediction.horizon_of`.
+    """
+    needs, config = policy.requirements, policy.head.config
+    cameras = None if needs.cameras is None else [camera.name for camera in needs.cameras]
+    return {
+        "observation": {
+            "cameras": cameras,
+            "camera_steps": _steps(needs.video_indices, needs.video_horizon),
+            "state": dict(needs.state),
+            "state_steps": _steps(needs.state_indices, needs.state_history),
+        },
+        "action_keys": [[group.key, group.size] for group in policy.normalizer.action_groups],
+        "horizon": horizon_of(policy),
+        "noise_shape": [config.action_horizon, config.encoder_action_dim],
+    }
+
+
+def check_shared(other: Mapping[str, Any], own: Mapping[str, Any], where: str) -> None:
+    """Checks that the settings of two runs make their chunks pairs.
+
+    Args:
+        other: Settings of the run that is compared with.
+        own: Settings of this run.
+        where: How the message begins.
+
+    Raises:
+        InputError: They differ; the message names the first difference.
+    """
+    for name in SHARED:
+        theirs, ours = (_comparable(one.get(name)) for one in (other, own))
+        if theirs != ours:
+            raise InputError(f"{where}: expected the {name} of this run, {ours}, got {theirs}")
+
+
+def described(settings: Mapping[str, Any]) -> str:
+    """Which checkpoint a run used, and how, in a few words.
+
+    Example:
+        >>> described({"checkpoint": {"name": "base"}, "options": {"precision": "int8"}, "sampling": {}})
+        'base, int8'
+        >>> eight = {"backbone": "int8", "head": "float32"}
+        >>> about = {"checkpoint": {"name": "base"}, "options": {"precision": eight}}
+        >>> described({**about, "sampling": {"num_steps": 2}})
+        'base, backbone int8, head float32, num_steps 2'
+    """
+    precision = settings["options"]["precision"]
+    parts = {"": precision} if isinstance(precision, str) else dict(precision)
+    if len(set(parts.values())) == 1:
+        parts = {"": next(iter(parts.values()))}
+    named = [f"{part} {name}".strip() for part, name in parts.items()]
+    named += [f"{name} {value}" for name, value in settings["sampling"].items()]
+    return ", ".join([settings["checkpoint"]["name"], *named])
+
+
+def _steps(indices: tuple[int, ...] | None, count: int | None) -> list[int] | int:
+    """The steps, or their number where the checkpoint does not say which; a missing history is one step."""
+    if indices is not None:
+        return list(indices)
+    return [0] if count is None or count == 1 else count
+
+
+def _comparable(value: Any) -> Any:
+    """Recordings may be called by other names: their hash counts."""
+    return value.get("sha256") if isinstance(value, Mapping) and "sha256" in value else value
