@@ -127,27 +127,10 @@ def verify(
     path = resolve(source, files=WEIGHTS)
     if not path.exists():
         raise FileNotFoundError(f"{path}: no such checkpoint")
-    say("names, shapes and types of the tensors")
-    try:
-        published = open_published(source)
-    except SaccadeError as error:
-        found.problems += lines_of(error)
+    read = _read(found, source, path, data_config, say)
+    if read is None or found.problems:
         return found
-    description = description_of(published, source)
-    found.version, found.layout = description.version, description.layout
-    has_backbone = _check_tensors(found, published, description, path)
-    say("values of the tensors")
-    try:
-        not_finite = count_not_finite([Path(file.path) for file in description.files])
-    except SaccadeError as error:
-        found.problems += lines_of(error)
-        return found
-    found.problems += [
-        f"{name}: {count} of {of} values are NaN or infinite" for name, (count, of) in not_finite.items()
-    ]
-    found.robots = robots_of(path, description.config.num_states, data_config)
-    if found.problems:
-        return found
+    published, has_backbone = read
     given = embodiment
     if embodiment is None:
         usable = [robot.embodiment for robot in found.robots if robot.problem is None]
@@ -162,14 +145,7 @@ def verify(
             "processor_options": processor_options,
             "num_threads": num_threads,
         }
-        try:
-            result = run_policy(path, options, seed, reference, say)
-            found.part, found.robot, found.reference = "policy", result.robot, result.reference
-            found.runs = result.runs
-        except MissingExtraError:
-            raise
-        except (SaccadeError, FileNotFoundError) as error:
-            found.refused = "; ".join(lines_of(error))
+        _run_whole(found, path, options, seed, reference, say)
     elif reference is not None:
         found.refused = "the reference compares whole policies, and the checkpoint has no backbone"
     if not found.runs:
@@ -187,6 +163,56 @@ def verify(
             f"{TOLERANCE:.0e}"
         )
     return found
+
+
+def _read(
+    found: Verification,
+    source: Source,
+    path: Path,
+    data_config: DataConfigLike | None,
+    say: Callable[[str], object],
+) -> tuple[_saccade.HeadCheckpoint, bool] | None:
+    """Checks the files; what opened them, and whether there is a backbone. None if they cannot be read."""
+    say("names, shapes and types of the tensors")
+    try:
+        published = open_published(source)
+    except SaccadeError as error:
+        found.problems += lines_of(error)
+        return None
+    description = description_of(published, source)
+    found.version, found.layout = description.version, description.layout
+    has_backbone = _check_tensors(found, published, description, path)
+    say("values of the tensors")
+    try:
+        not_finite = count_not_finite([Path(file.path) for file in description.files])
+    except SaccadeError as error:
+        found.problems += lines_of(error)
+        return None
+    found.problems += [
+        f"{name}: {count} of {of} values are NaN or infinite" for name, (count, of) in not_finite.items()
+    ]
+    found.robots = robots_of(path, description.config.num_states, data_config)
+    return published, has_backbone
+
+
+def _run_whole(
+    found: Verification,
+    path: Path,
+    options: Mapping[str, Any],
+    seed: int,
+    reference: Reference | None,
+    say: Callable[[str], object],
+) -> None:
+    """Runs the whole policy at each precision, or notes why it is refused."""
+    try:
+        result = run_policy(path, options, seed, reference, say)
+    except MissingExtraError:
+        raise
+    except (SaccadeError, FileNotFoundError) as error:
+        found.refused = "; ".join(lines_of(error))
+    else:
+        found.part, found.robot, found.reference = "policy", result.robot, result.reference
+        found.runs = result.runs
 
 
 def _check_tensors(
