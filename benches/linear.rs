@@ -120,9 +120,10 @@ fn saccade<'a>(shape: &'a Shape, options: &Options, contenders: &mut Vec<Contend
             (Arithmetic::Float32, narrow, " of bf16 weights"),
             (Arithmetic::Bfloat16, narrow, ""),
             (Arithmetic::Int8, wide, ""),
+            (Arithmetic::Int4, wide, ""),
         ] {
             // Where an instruction set multiplies as the one before does, it is not measured again.
-            if isa == Isa::Avx2Vnni && arithmetic != Arithmetic::Int8
+            if isa == Isa::Avx2Vnni && !matches!(arithmetic, Arithmetic::Int8 | Arithmetic::Int4)
                 || isa == Isa::Avx512f && arithmetic == Arithmetic::Float32
             {
                 continue;

@@ -1,5 +1,5 @@
-"""Error from rounding one group of layers: the action chunk of the torch reference with that group in int8 or
-bfloat16 and everything else in float32.
+"""Error from rounding one group of layers: the action chunk of the torch reference with that group in int8,
+int4 or bfloat16 and everything else in float32.
 
 Needs the package and torch. Prints the Markdown table of docs/precision.md:
 
@@ -47,6 +47,19 @@ def int8_weight(weight: Tensor) -> Tensor:
     """Rows `(out, in)` rounded to 255 steps of their largest magnitude."""
     scale = weight.abs().amax(dim=-1, keepdim=True).clamp_min(1e-30) / 127
     return (weight / scale).round() * scale
+
+
+def int4_weight(weight: Tensor) -> Tensor:
+    """Rows `(out, in)` rounded to 15 steps: of eight scales the one with the least squared error."""
+    full = weight.abs().amax(dim=-1, keepdim=True).clamp_min(1e-30) / 7
+    best, least = torch.zeros_like(weight), torch.full_like(full, torch.inf)
+    for twelfths in range(12, 4, -1):
+        scale = full * (twelfths / 12)
+        rounded = (weight / scale).round().clamp(-7, 7) * scale
+        error = (rounded - weight).square().sum(dim=-1, keepdim=True)
+        best = torch.where(error < least, rounded, best)
+        least = torch.minimum(error, least)
+    return best
 
 
 def int8_rows(x: Tensor) -> Tensor:
@@ -122,12 +135,11 @@ def main() -> None:
             return actions.double()
 
     exact = chunk()
-    print(
-        "| rounded | int8: largest | int8: rms | bfloat16: largest | bfloat16: rms |\n|---|---|---|---|---|"
-    )
+    columns = [f"{kind}: {size}" for kind in ("int4", "int8", "bfloat16") for size in ("largest", "rms")]
+    print(f"| rounded | {' | '.join(columns)} |\n{'|---' * (len(columns) + 1)}|")
     for group, pattern in INT8_GROUPS.items():
         cells = []
-        for weights, rows in ((int8_weight, int8_rows), (bfloat16, bfloat16)):
+        for weights, rows in ((int4_weight, int8_rows), (int8_weight, int8_rows), (bfloat16, bfloat16)):
             before = round_group(head, pattern, weights, rows)
             if not before:
                 cells += ["", ""]

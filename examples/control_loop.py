@@ -306,7 +306,7 @@ def main() -> None:
     parser.add_argument("--small", action="store_true", help="a small random checkpoint, for a quick trial")
     parser.add_argument("--cameras", nargs="+", help="which of its cameras (default: all)")
     parser.add_argument("--instruction", default="open the drawer", help="default: open the drawer")
-    parser.add_argument("--precision", default="int8", help="float32, bfloat16 or int8 (default int8)")
+    parser.add_argument("--precision", default="int8", help="float32, bfloat16, int8 or int4 (default int8)")
     parser.add_argument("--num-threads", type=int, help="of the policy (default: the physical cores)")
     parser.add_argument("--rate", type=float, default=10, help="actions per second (default 10)")
     parser.add_argument("--seconds", type=float, default=20, help="of each run (default 20)")

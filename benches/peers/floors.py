@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from benches.cost import floors
+from benches.cost import ELEMENT_BYTES, floors
 from benches.peers.cases import Case, exact_macs
 from benches.peers.contenders import CONTENDERS
 from benches.peers.results import Results
 from benches.peers.text import arithmetic, calls, config
 from benches.work import Works, encode_work, sample_work
-from saccade._internal.arrays import PRECISIONS
 from saccade_lab.timing import Call, Machine
 
 
@@ -34,7 +33,7 @@ def limits(results: Results, case: Case, name: str) -> tuple[float, float] | Non
 def machine_of(results: Results, case: Case, name: str) -> Machine | None:
     """The peaks for a contender; None if one of them was not measured."""
     isa = CONTENDERS[name].environment.get("SACCADE_ISA", results.data["machine"]["isa"])
-    rates = {kind: results.peak(case.threads, isa, kind) for kind in PRECISIONS}
+    rates = {kind: results.peak(case.threads, isa, kind) for kind in ELEMENT_BYTES}
     known = {kind: rate for kind, rate in rates.items() if rate is not None}
     bandwidth = results.bandwidth(case.threads)
     if len(known) < len(rates) or bandwidth is None:

@@ -72,6 +72,7 @@ pub fn arithmetic_name(arithmetic: Arithmetic) -> &'static str {
         Arithmetic::Float32 => "float32",
         Arithmetic::Bfloat16 => "bfloat16",
         Arithmetic::Int8 => "int8",
+        Arithmetic::Int4 => "int4",
     }
 }
 

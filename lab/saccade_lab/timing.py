@@ -20,7 +20,7 @@ from saccade_lab.head_inputs import HeadInputs
 #: The timed calls: encoding an observation, sampling a chunk from its context, and both.
 WORKS = ("encode", "sample", "both")
 
-#: The parts that an int8 head computes in bfloat16, a hundredth of the work.
+#: The parts that an int8 or int4 head computes in bfloat16, a hundredth of the work.
 NOT_INT8 = ("attention", "embodiment", "output")
 
 
@@ -157,7 +157,7 @@ class Counter:
 
 def arithmetic_of(part: str, precision: str) -> str:
     """The arithmetic of a part in a head of this precision."""
-    return "bfloat16" if precision == "int8" and part in NOT_INT8 else precision
+    return "bfloat16" if precision in ("int8", "int4") and part in NOT_INT8 else precision
 
 
 def works_of(head: ActionHead, call: Call) -> dict[str, Callable[[], Any]]:

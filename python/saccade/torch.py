@@ -69,7 +69,7 @@ class CrossAttention(nn.Module):
             ``to_out.0.weight (width, width)``, and ``to_q.bias``, ``to_k.bias``, ``to_v.bias``,
             ``to_out.0.bias (width,)``; floating point, on the CPU.
         heads: Number of attention heads, a divisor of the width.
-        precision: ``"float32"``, ``"bfloat16"`` or ``"int8"``, as in
+        precision: ``"float32"``, ``"bfloat16"``, ``"int8"`` or ``"int4"``, as in
             :meth:`saccade.ActionHead.from_pretrained`.
         dropout: Probability of the dropout after ``to_out.0`` in training. It is not implemented: a call in
             training mode with a dropout other than 0 raises an error.

@@ -43,7 +43,7 @@ def test_masks_and_places_of_views(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", NAMES)
-@pytest.mark.parametrize(("precision", "bound"), [("bfloat16", 0.015), ("int8", 0.08)])
+@pytest.mark.parametrize(("precision", "bound"), [("bfloat16", 0.015), ("int8", 0.08), ("int4", 0.8)])
 def test_lower_precisions_are_close(name: str, precision: str, bound: float, isa: str) -> None:
     """The released code's own bfloat16 runs are 0.9 % from float64 (n15_bf16)."""
     released = released_backbone(name)
@@ -62,7 +62,7 @@ def test_bfloat16_is_as_close_as_the_released_run() -> None:
 
 
 @pytest.mark.parametrize("name", NAMES)
-@pytest.mark.parametrize("precision", ["float32", "bfloat16", "int8"])
+@pytest.mark.parametrize("precision", ["float32", "bfloat16", "int8", "int4"])
 def test_threads_do_not_change_bits(name: str, precision: str) -> None:
     released = released_backbone(name)
     one, three = (
@@ -72,7 +72,7 @@ def test_threads_do_not_change_bits(name: str, precision: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["n15_batch_padded", "n15_pixel_shuffle", "n17_batch_padded"])
-@pytest.mark.parametrize("precision", ["float32", "bfloat16", "int8"])
+@pytest.mark.parametrize("precision", ["float32", "bfloat16", "int8", "int4"])
 def test_rows_of_a_batch_have_their_bits_alone(name: str, precision: str) -> None:
     released = released_backbone(name)
     backbone = released.load(precision)
@@ -232,3 +232,4 @@ def test_int8_bears_outliers(kind: str, isa: str) -> None:
 
     # Without outliers it is 0.03 to 0.06.
     assert relative_error(features("int8"), features("float32")) < 0.08
+    assert relative_error(features("int4"), features("float32")) < 0.8

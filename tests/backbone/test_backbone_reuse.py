@@ -12,7 +12,7 @@ import saccade
 from saccade import _saccade
 from tests.helpers.released_backbones import NAMES, ReleasedBackbone, released_backbone
 
-PRECISIONS = ("float32", "bfloat16", "int8")
+PRECISIONS = ("float32", "bfloat16", "int8", "int4")
 
 
 def assert_same(given: saccade.BackboneFeatures, expected: saccade.BackboneFeatures) -> None:

@@ -11,10 +11,9 @@ import pytest
 
 import saccade
 from benches import cost, roofline
-from benches.cost import floors, measured_like, predict
+from benches.cost import ELEMENT_BYTES, floors, measured_like, predict
 from benches.work import encode_work, sample_work, total
 from saccade import _saccade
-from saccade._internal.arrays import PRECISIONS
 from saccade.head.config import HeadConfig
 from saccade_lab.random_checkpoint.head import config_of_size, write_head
 from saccade_lab.timing import Call, Machine, profiled, works_of
@@ -167,6 +166,8 @@ def assert_counted(head: saccade.ActionHead, call: Call) -> None:
 # Floors and the model
 
 
+#: Those that were measured.
+PRECISIONS = tuple(ELEMENT_BYTES)
 MACHINE = Machine("avx512", 1, {"float32": 1e9, "bfloat16": 2e9, "int8": 4e9}, 1e9)
 
 

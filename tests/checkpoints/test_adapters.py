@@ -199,10 +199,11 @@ def test_an_adapter_of_another_model(base: Path, tmp_path: Path) -> None:
         convert(base, tmp_path / "out", adapter=adapter)
 
 
-def test_a_quantised_base(base: Path, tmp_path: Path) -> None:
-    quantize(base, tmp_path / "int8")
-    with pytest.raises(CheckpointError, match="is I8: expected weights that are not quantised"):
-        convert(tmp_path / "int8", tmp_path / "out", adapter=copy_adapter(tmp_path / "adapter"))
+@pytest.mark.parametrize(("to", "dtype"), [("int8", "I8"), ("int4", "U8")])
+def test_a_quantised_base(base: Path, to: str, dtype: str, tmp_path: Path) -> None:
+    quantize(base, tmp_path / to, to=to)
+    with pytest.raises(CheckpointError, match=f"is {dtype}: expected weights that are not quantised"):
+        convert(tmp_path / to, tmp_path / "out", adapter=copy_adapter(tmp_path / "adapter"))
 
 
 def test_the_adapters_other_files_take_the_place_of_the_bases(base: Path, tmp_path: Path) -> None:

@@ -223,17 +223,20 @@ def test_head_only(source: Path, tmp_path: Path) -> None:
     assert same(actions(source), actions(tmp_path / "out"))
 
 
-def test_int8_keeps_its_scales(source: Path, tmp_path: Path) -> None:
-    quantize(source, tmp_path / "int8")
-    convert(tmp_path / "int8", tmp_path / "out", dtype="bfloat16")
-    before, after = tensors_of(tmp_path / "int8"), tensors_of(tmp_path / "out")
-    integers = [name for name, t in before.items() if t.dtype == torch.int8]
+@pytest.mark.parametrize(("to", "dtype"), [("int8", torch.int8), ("int4", torch.uint8)])
+def test_quantised_weights_keep_their_scales(
+    source: Path, to: str, dtype: torch.dtype, tmp_path: Path
+) -> None:
+    quantize(source, tmp_path / to, to=to)
+    convert(tmp_path / to, tmp_path / "out", dtype="bfloat16")
+    before, after = tensors_of(tmp_path / to), tensors_of(tmp_path / "out")
+    integers = [name for name, t in before.items() if t.dtype == dtype]
     assert integers
     for name in integers:
         for kept in (name, f"{name}_scale"):
             assert after[kept].dtype == before[kept].dtype
             assert torch.equal(after[kept], before[kept])
-    assert actions(tmp_path / "out", precision="int8").shape == (1, 16, 8)
+    assert actions(tmp_path / "out", precision=to).shape == (1, 16, 8)
 
 
 def test_the_files_say_where_they_come_from(source: Path, tmp_path: Path) -> None:

@@ -46,7 +46,7 @@ def actions(head: saccade.ActionHead, embodiment_id: int = 1) -> Any:
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16, torch.float16])
-@pytest.mark.parametrize("precision", ["float32", "bfloat16", "int8"])
+@pytest.mark.parametrize("precision", ["float32", "bfloat16", "int8", "int4"])
 def test_the_bits_of_a_loaded_head(isa: str, dtype: torch.dtype, precision: str, tmp_path: Path) -> None:
     tensors = weights(dtype)
     from_file, from_memory = (

@@ -74,7 +74,7 @@ def base(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize("layout", ["nvidia", "fork", "n1", "n17"])
-@pytest.mark.parametrize("precision", ["float32", "bfloat16", "int8"])
+@pytest.mark.parametrize("precision", ["float32", "bfloat16", "int8", "int4"])
 def test_memory_is_what_a_head_holds(tmp_path: Path, layout: str, precision: str) -> None:
     folder = layouts.write(tmp_path / layout, layout)
     memory = inspect(folder).memory[precision]

@@ -1,4 +1,4 @@
-"""Checkpoints quantised to int8: what is written, that it loads with the same bits, and what is refused."""
+"""Checkpoints quantised to int8 and int4: what is written, that it loads with equal bits, what is refused."""
 
 from __future__ import annotations
 
@@ -24,12 +24,13 @@ from tests.helpers.engine_cases import arrays, save
 from tests.helpers.reference_cases import small_config
 
 # Odd sizes; the width of the feed-forward makes sums of several hundred products.
-CONFIG = small_config(num_heads=2, head_dim=33, context_dim=62, hidden_dim=51, num_layers=3)
+CONFIG = small_config(num_heads=2, head_dim=33, context_dim=63, vl_num_heads=3, hidden_dim=51, num_layers=3)
 BLOCK_WEIGHT = re.compile(
     r"action_head\.(model|vl_self_attention)\.transformer_blocks\.\d+\.(attn1|ff)\..*weight"
 )
 SCALE = "action_head.model.transformer_blocks.0.attn1.to_q.weight_scale"
 WEIGHT = SCALE.removesuffix("_scale")
+ODD_WEIGHT = WEIGHT.replace("to_q", "to_k")  # of 63 inputs
 
 
 @pytest.fixture
@@ -49,6 +50,23 @@ def source(tmp_path: Path) -> Path:
 def quantized(source: Path, tmp_path: Path) -> Path:
     quantize(source, tmp_path / "int8")
     return tmp_path / "int8"
+
+
+@pytest.fixture
+def int4(source: Path, tmp_path: Path) -> Path:
+    quantize(source, tmp_path / "int4", to="int4")
+    return tmp_path / "int4"
+
+
+def integers(values: Tensor, width: int) -> Tensor:
+    """What int8 `(out, width)` or int4 `(out, width / 2)` stand for, by the format's definition."""
+    if values.dtype == torch.int8:
+        return values
+    pairs = values.to(torch.int16)
+    both = torch.stack((pairs % 16, pairs // 16), dim=2).flatten(1)
+    both = torch.where(both > 7, both - 16, both)
+    assert bool((both[:, width:] == 0).all())
+    return both[:, :width].to(torch.int8)
 
 
 def actions(checkpoint: Path, **options: Any) -> np.ndarray[Any, Any]:
@@ -90,6 +108,50 @@ def test_weights_are_integers_and_scales_and_all_else_is_as_it_was(source: Path,
     assert (quantized / "config.json").read_text() == (source / "config.json").read_text()
 
 
+def test_int4_has_two_weights_in_a_byte(source: Path, int4: Path) -> None:
+    before, after = tensors_of(source), tensors_of(int4)
+    for name, weight in before.items():
+        if not BLOCK_WEIGHT.fullmatch(name):
+            assert torch.equal(after[name], weight)
+            continue
+        values, scales = after[name], after[f"{name}_scale"].double()
+        assert (values.dtype, values.shape) == (torch.uint8, (len(weight), (weight.shape[1] + 1) // 2))
+        steps = integers(values, weight.shape[1]).double()
+        assert int(steps.abs().max()) == 7
+        # In float64: the nearest step that there is, by a scale whose error is the least.
+        scales = scales[:, None]
+        ratios = scales * 7 / weight.double().abs().amax(dim=1, keepdim=True) * 12
+        torch.testing.assert_close(ratios, ratios.round(), rtol=1e-5, atol=0)
+        assert 5 <= ratios.min().round() < ratios.max().round() <= 12
+        nearest = (weight.double() / scales).clamp(-7, 7)
+        assert bool(((steps - nearest).abs() <= 0.5 + 1e-4).all())
+        errors = torch.stack(
+            [
+                (
+                    (weight.double() / (scales * k / ratios)).round().clamp(-7, 7) * scales * k / ratios
+                    - weight
+                )
+                .square()
+                .sum(dim=1)
+                for k in range(5, 13)
+            ]
+        )
+        found = (steps * scales - weight.double()).square().sum(dim=1)
+        assert bool((found <= errors.amin(dim=0) * (1 + 1e-4)).all())
+    assert (int4 / "config.json").read_text() == (source / "config.json").read_text()
+    size = {folder: (folder / "model.safetensors").stat().st_size for folder in (source, int4)}
+    assert size[int4] < size[source]
+
+
+def test_only_integers_are_quantised_to(source: Path, tmp_path: Path) -> None:
+    for given in ("bfloat16", "float32"):
+        with pytest.raises(InputError, match=f"to: expected 'int8' or 'int4', got '{given}'"):
+            quantize(source, tmp_path / "out", to=given)
+    with pytest.raises(InputError, match="expected one of"):
+        quantize(source, tmp_path / "out", to="int2")
+    assert not (tmp_path / "out").exists()
+
+
 def test_the_files_say_where_they_come_from(quantized: Path) -> None:
     with safe_open(quantized / "model.safetensors", "pt") as file:
         metadata = file.metadata()
@@ -98,27 +160,36 @@ def test_the_files_say_where_they_come_from(quantized: Path) -> None:
     assert metadata["format"] == "pt"
 
 
-def test_int8_has_the_bits_of_quantising_at_load(isa: str, source: Path, quantized: Path) -> None:
-    assert np.array_equal(actions(source, precision="int8"), actions(quantized, precision="int8"))
+@pytest.mark.parametrize("to", ["int8", "int4"])
+def test_files_have_the_bits_of_quantising_at_load(isa: str, to: str, source: Path, tmp_path: Path) -> None:
+    quantize(source, tmp_path / to, to=to)
+    assert np.array_equal(actions(source, precision=to), actions(tmp_path / to, precision=to))
 
 
+@pytest.mark.parametrize("to", ["int8", "int4"])
 @pytest.mark.parametrize("precision", ["float32", "bfloat16"])
 def test_other_precisions_have_what_the_integers_stand_for(
-    isa: str, precision: str, quantized: Path, tmp_path: Path
+    isa: str, precision: str, to: str, source: Path, tmp_path: Path
 ) -> None:
+    quantized = tmp_path / to
+    quantize(source, quantized, to=to)
+    widths = {name: t.shape[-1] for name, t in tensors_of(source).items() if t.ndim == 2}
     stands_for = tmp_path / "float"
     stands_for.mkdir()
     tensors = tensors_of(quantized)
     floats = {name: t for name, t in tensors.items() if not name.endswith("_scale")}
     for name in floats:
         if f"{name}_scale" in tensors:
-            floats[name] = tensors[name].float() * tensors[f"{name}_scale"][:, None]
+            whole = integers(tensors[name], widths[name]).float()
+            floats[name] = whole * tensors[f"{name}_scale"][:, None]
     save_file(floats, stands_for / "model.safetensors")
     (stands_for / "config.json").write_text(json.dumps(CONFIG))
     assert np.array_equal(actions(quantized, precision=precision), actions(stands_for, precision=precision))
     read = read_tensors(quantized, "action_head.")
     name = WEIGHT.removeprefix("action_head.")
-    assert np.array_equal(read[name], floats[WEIGHT].numpy())
+    width = floats[WEIGHT].shape[1]
+    assert np.array_equal(read[name][:, :width], floats[WEIGHT].numpy())
+    assert not read[name][:, width:].any()
 
 
 @pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
@@ -142,7 +213,7 @@ def test_large_checkpoints_are_cut_into_files(source: Path, tmp_path: Path) -> N
         "progress": None,
     }
     rewrite |= {"head_only": False, "keep_backbone": False, "force": False, "max_shard_bytes": 100_000}
-    report = _saccade.quantize(rewrite)
+    report = _saccade.quantize(rewrite, "int8")
     files = sorted(out.glob("*.safetensors"))
     assert len(files) > 2
     assert sorted(report["files"]) == files
@@ -216,9 +287,11 @@ def test_an_empty_directory_is_taken(source: Path, tmp_path: Path) -> None:
     assert (tmp_path / "out" / "model.safetensors").exists()
 
 
-def test_a_quantised_source_is_refused(quantized: Path, tmp_path: Path) -> None:
-    with pytest.raises(CheckpointError, match="quantised already"):
-        quantize(quantized, tmp_path / "again")
+@pytest.mark.parametrize("to", ["int8", "int4"])
+def test_a_quantised_source_is_refused(to: str, quantized: Path, int4: Path, tmp_path: Path) -> None:
+    for given, dtype in ((quantized, "I8"), (int4, "U8")):
+        with pytest.raises(CheckpointError, match=f"quantised already: .* is {dtype}, expected F32"):
+            quantize(given, tmp_path / "again", to=to)
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf")])
@@ -268,7 +341,7 @@ HOSTILE: dict[str, tuple[Callable[[dict[str, Tensor]], object], str]] = {
     "scale of a wrong type": (lambda t: t.update({SCALE: t[SCALE].half()}), "_scale is F16, expected F32"),
     "scale without int8": (
         lambda t: t.update({WEIGHT: t[WEIGHT].float()}),
-        "is there, but .* is F32, expected I8",
+        "is there, but .* is F32, expected I8 or U8",
     ),
     "scale without weight": (lambda t: t.pop(WEIGHT), "to_q.weight is missing"),
     "scale of a bias": (
@@ -280,9 +353,9 @@ HOSTILE: dict[str, tuple[Callable[[dict[str, Tensor]], object], str]] = {
     "negative": (lambda t: t[SCALE][0].fill_(-0.5), "_scale is -0.5 at index 0, expected finite"),
     "zero": (lambda t: t[SCALE][5].fill_(0), "_scale is 0 at index 5, whose row of .* is not zero"),
     "-128": (lambda t: t[WEIGHT][7].fill_(-128), "holds -128, expected -127 to 127"),
-    "unsigned": (
+    "bytes that are no pairs": (
         lambda t: t.update({WEIGHT: t[WEIGHT].to(torch.uint8)}),
-        "is U8, expected .* or I8",
+        r"has shape \(66, 66\), expected \(66, 33\)",
     ),
     "int8 where none runs": (
         lambda t: t.update({"action_head.model.proj_out_2.weight": torch.ones(51, 66, dtype=torch.int8)}),
@@ -298,6 +371,44 @@ def test_hostile_files(case: str, precision: str, quantized: Path) -> None:
     rewrite(quantized, change)
     with pytest.raises(CheckpointError, match=message):
         actions(quantized, precision=precision)
+
+
+HOSTILE_INT4: dict[str, tuple[Callable[[dict[str, Tensor]], object], str]] = {
+    "missing scale": (lambda t: t.pop(SCALE), "is U8 and .*_scale is missing, expected \\(66,\\)"),
+    "a column less": (
+        lambda t: t.update({WEIGHT: t[WEIGHT][:, 1:].clone()}),
+        r"has shape \(66, 32\), expected \(66, 33\)",
+    ),
+    "NaN": HOSTILE["NaN"],
+    "zero": HOSTILE["zero"],
+    "-8 in the low half": (lambda t: t[WEIGHT][7, 3].fill_(0x18), "holds -8 in four bits, expected -7 to 7"),
+    "-8 in the high half": (lambda t: t[WEIGHT][7, 3].fill_(0x81), "holds -8 in four bits, expected -7 to 7"),
+    "a weight after the last": (
+        lambda t: t[ODD_WEIGHT][9, 31].fill_(0x11),
+        "to_k.weight: row 9 has 63 weights of four bits, expected zero in the high half of its last byte",
+    ),
+    "int4 where none runs": (
+        lambda t: t.update({"action_head.model.proj_out_2.weight": torch.ones(51, 66, dtype=torch.uint8)}),
+        "proj_out_2.weight is U8, expected F32, BF16 or F16",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", HOSTILE_INT4)
+@pytest.mark.parametrize("precision", ["float32", "int4"])
+def test_hostile_files_of_int4(case: str, precision: str, int4: Path) -> None:
+    change, message = HOSTILE_INT4[case]
+    rewrite(int4, change)
+    with pytest.raises(CheckpointError, match=message):
+        actions(int4, precision=precision)
+
+
+def test_int8_and_int4_in_one_file(isa: str, quantized: Path, int4: Path) -> None:
+    """A layer is loaded from whatever it is stored as."""
+    wide = tensors_of(quantized)
+    rewrite(int4, lambda tensors: tensors.update({name: wide[name] for name in (WEIGHT, SCALE)}))
+    for precision in ("int8", "int4"):
+        assert np.isfinite(actions(int4, precision=precision)).all()
 
 
 def test_extreme_integers_do_not_overflow(isa: str, quantized: Path) -> None:

@@ -82,6 +82,23 @@ def test_quantize_stores_the_blocks_of_backbone_and_head(layout: str, tmp_path: 
         quantize(out, tmp_path / "again")
 
 
+@pytest.mark.parametrize("layout", whole_checkpoints.LAYOUTS)
+def test_quantize_to_int4(layout: str, tmp_path: Path) -> None:
+    source, out = whole(layout), tmp_path / "int4"
+    report = quantize(source, out, to="int4")
+    tensors, before = backbone(out, layout), backbone(source, layout)
+    for block in BLOCKS[layout]:
+        weight, width = tensors[f"{block}.weight"], before[f"{block}.weight"].shape[1]
+        assert (weight.dtype, weight.shape[1]) == (torch.uint8, (width + 1) // 2)
+    assert report.num_quantized_backbone == sum(tensor.dtype == torch.uint8 for tensor in tensors.values())
+    assert report.backbone_bytes_after == sum(tensor.nbytes for tensor in tensors.values())
+    assert sidecars(out) == sidecars(source)
+    for precision in ("int4", "int8"):
+        policy = Policy.from_pretrained(out, embodiment=EMBODIMENT, precision=precision)
+        assert str(policy.head).count(f"precision={precision}") == 1
+    assert same(act(out, "int4"), act(source, "int4"))
+
+
 def test_quantize_may_keep_the_backbone(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     source, out = whole("isaac"), tmp_path / "int8"
     assert cli.main(["quantize", str(source), "--out", str(out), "--keep-backbone"]) == 0

@@ -99,7 +99,7 @@ def second_context(head: saccade.ActionHead, batch: int = 3, length: int = 5) ->
     return head.encode(rng.standard_normal((batch, length, head.config.context_dim), np.float32))
 
 
-@pytest.mark.parametrize("precision", ["float32", "bfloat16", "int8"])
+@pytest.mark.parametrize("precision", ["float32", "bfloat16", "int8", "int4"])
 @pytest.mark.parametrize("integrator", ["euler", "midpoint"])
 def test_it_is_the_definition_bit_by_bit(integrator: str, precision: str) -> None:
     released = load_released("n15_tiny")

@@ -157,7 +157,7 @@ def test_velocity(error: type[Exception], message: str, options: dict[str, Any])
     ("message", "options"),
     [
         (
-            "precision: expected one of 'float32', 'bfloat16', 'int8', got 'float8'",
+            "precision: expected one of 'float32', 'bfloat16', 'int8', 'int4', got 'float8'",
             {"precision": "float8"},
         ),
         ("num_threads: expected at least 1, got 0", {"num_threads": 0}),

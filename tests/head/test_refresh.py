@@ -20,7 +20,7 @@ from tests.helpers.intervention_cases import Case, cases, everything, per_isa
 from tests.helpers.reference_cases import relative_error, small_config
 from tests.helpers.released import load_released
 
-PRECISIONS = ("float32", "bfloat16", "int8")
+PRECISIONS = ("float32", "bfloat16", "int8", "int4")
 
 #: The action rows read no other rows: what the others hold cannot matter.
 BLIND = Intervention(cut=[("action", "state"), ("action", "future")])

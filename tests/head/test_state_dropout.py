@@ -68,7 +68,7 @@ def test_only_a_state_that_was_always_dropped_has_no_effect(kind: str, load: Any
         assert not same(*two_states(head, embodiment))
 
 
-@pytest.mark.parametrize("precision", ["float32", "bfloat16", "int8"])
+@pytest.mark.parametrize("precision", ["float32", "bfloat16", "int8", "int4"])
 def test_it_is_a_state_of_zeros(precision: str, isa: str, tmp_path: Path) -> None:
     head = saccade.ActionHead.from_pretrained(write(tmp_path), precision=precision)
     inputs = arrays(random_inputs(head.config, 5, batch=3, num_vl_tokens=6))

@@ -100,7 +100,7 @@ def test_one_state_is_the_default(kind: str, tmp_path: Path) -> None:
     assert same(head(**(given | {"state": given["state"][:, 0]})), expected)
 
 
-@pytest.mark.parametrize("precision", ["bfloat16", "int8"])
+@pytest.mark.parametrize("precision", ["bfloat16", "int8", "int4"])
 @pytest.mark.parametrize("kind", ["n1.5", "n1.6"])
 def test_an_observation_has_the_same_bits_in_any_batch(kind: str, precision: str, tmp_path: Path) -> None:
     head, reference, inputs = both(tmp_path, kind, 2, precision)
@@ -114,7 +114,7 @@ def test_an_observation_has_the_same_bits_in_any_batch(kind: str, precision: str
         samples = head.sample(head.encode(features, **masks), **rest, noise=noise, num_samples=2)
         assert same(samples[:, 1], many[row : row + 1])
     with torch.no_grad():
-        assert relative_error(many, reference(**inputs)) <= 0.1
+        assert relative_error(many, reference(**inputs)) <= (0.4 if precision == "int4" else 0.1)
 
 
 @pytest.mark.parametrize("kind", ["n1.5", "n1.6"])

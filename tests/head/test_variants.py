@@ -28,7 +28,7 @@ from tests.helpers.reference_cases import KINDS, relative_error, variant_config
 # Bits
 
 
-@pytest.mark.parametrize("precision", ["float32", "bfloat16", "int8"])
+@pytest.mark.parametrize("precision", ["float32", "bfloat16", "int8", "int4"])
 @pytest.mark.parametrize("kind", ["n1.6", "n1.7", "split-arms", "biased"])
 def test_bits_do_not_depend_on_batch_samples_or_threads(
     isa: str, kind: str, precision: str, tmp_path: Path

@@ -29,6 +29,7 @@ from saccade_lab.reference.random_weights import random_tensor
 #: from torch's float32 functions; where the original rounds to bfloat16, saccade does not.
 EXACT = 3e-4
 ROUNDED = 0.05
+INT4 = 0.5  # of parts as small as these
 
 
 @dataclass(frozen=True)
@@ -147,18 +148,25 @@ def error(got: Tensor, expected: Tensor) -> float:
     return float(torch.linalg.vector_norm(got.float() - expected.float()) / size.clamp_min(1e-30))
 
 
+def tolerance_of(dtype: torch.dtype, autocast: bool, precision: Any) -> float:
+    """The largest relative error of an accelerated part."""
+    if precision == "int4":
+        return INT4
+    exact = dtype is torch.float32 and not autocast and precision == "float32"
+    return EXACT if exact else ROUNDED
+
+
 def check_equal_seeds(
     case: Case, *, batch: int, dtype: torch.dtype = torch.float32, autocast: bool = False, **options: Any
 ) -> float:
     """Equal seeds, equal actions; the largest relative error."""
     case.head.to(dtype)
     given = inputs(case, batch=batch, dtype=torch.bfloat16 if autocast else dtype)
-    exact = dtype is torch.float32 and not autocast and options.get("precision", "float32") == "float32"
+    tolerance = tolerance_of(dtype, autocast, options.get("precision", "float32"))
     theirs = [call(case, given, seed=seed, autocast=autocast) for seed in (7, 8)]
     with accelerate(case.head, **options):
         ours = [call(case, given, seed=seed, autocast=autocast) for seed in (7, 8)]
     assert not torch.equal(theirs[0].results["action_pred"], theirs[1].results["action_pred"])
-    tolerance = EXACT if exact else ROUNDED
     return max(assert_same(a, b, tolerance) for a, b in zip(ours, theirs, strict=True))
 
 

@@ -23,7 +23,7 @@ import saccade
 from saccade.integrations import Accelerated, accelerate
 from saccade.integrations.accelerated_backbone import AcceleratedBackbone
 from tests.helpers import whole_policies
-from tests.helpers.integration_cases import EXACT, ROUNDED, average, error, load, step
+from tests.helpers.integration_cases import EXACT, average, error, load, step, tolerance_of
 
 
 @dataclass(frozen=True)
@@ -90,11 +90,11 @@ def check_the_same(
     """Equal features and actions; the relative error of the actions."""
     whole.model.to(dtype)
     given = whole.observations(batch, views)
-    exact = dtype is torch.float32 and not autocast and options.get("precision", "float32") == "float32"
+    tolerance = tolerance_of(dtype, autocast, options.get("precision", "float32"))
     theirs = call(whole, given, autocast=autocast)
     with accelerate(whole.model, backbone=True, **options):
         ours = call(whole, given, autocast=autocast)
-    return assert_same(ours, theirs, EXACT if exact else ROUNDED)
+    return assert_same(ours, theirs, tolerance)
 
 
 def check_restore(whole: Whole) -> None:

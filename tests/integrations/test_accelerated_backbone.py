@@ -37,7 +37,9 @@ def test_the_same(whole: cases.Whole, dtype: torch.dtype, autocast: bool, batch:
     cases.check_the_same(whole, dtype=dtype, autocast=autocast, batch=batch, views=views)
 
 
-@pytest.mark.parametrize("precision", ["bfloat16", "int8", {"backbone": "int8", "head": "bfloat16"}], ids=str)
+@pytest.mark.parametrize(
+    "precision", ["bfloat16", "int8", "int4", {"backbone": "int8", "head": "bfloat16"}], ids=str
+)
 def test_precisions(whole: cases.Whole, precision: Any) -> None:
     cases.check_the_same(whole, dtype=torch.float32, autocast=False, batch=2, views=1, precision=precision)
 

@@ -78,7 +78,7 @@ def test_equal_seeds_give_equal_actions(kind: str, dtype: torch.dtype, autocast:
     cases.check_equal_seeds(CASES[kind](), batch=batch, dtype=dtype, autocast=autocast)
 
 
-@pytest.mark.parametrize("precision", ["bfloat16", "int8"])
+@pytest.mark.parametrize("precision", ["bfloat16", "int8", "int4"])
 def test_other_precisions(precision: str) -> None:
     cases.check_equal_seeds(n15(), batch=2, precision=precision)
 

@@ -148,7 +148,7 @@ def test_autocast(compiled: bool) -> None:
     assert called(states, context).dtype == torch.float32
 
 
-@pytest.mark.parametrize("precision", ["bfloat16", "int8"])
+@pytest.mark.parametrize("precision", ["bfloat16", "int8", "int4"])
 def test_precisions_are_the_engines(precision: str) -> None:
     module = attention()
     states, context = tensors()

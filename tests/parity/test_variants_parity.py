@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 import saccade
-from benches.precision_groups import DIT, VL, bfloat16, int8_rows, int8_weight, round_group
+from benches.precision_groups import DIT, VL, bfloat16, int4_weight, int8_rows, int8_weight, round_group
 from saccade import Chunking, Intervention
 from saccade_lab.reference import ActionHead as Reference
 from saccade_lab.reference.random_weights import random_head, random_inputs
@@ -238,7 +238,8 @@ DECODERS = r"action_(arm_|left_arm_|right_arm_|claw_)?decoder"
 
 def rounded(reference: Reference, precision: str) -> Reference:
     """The reference with the rounding of this precision written out in torch; sums stay float64."""
-    weights, rows = (int8_weight, int8_rows) if precision == "int8" else (bfloat16, bfloat16)
+    by_precision = {"bfloat16": (bfloat16, bfloat16), "int8": (int8_weight, int8_rows)}
+    weights, rows = (by_precision | {"int4": (int4_weight, int8_rows)})[precision]
     assert round_group(reference, rf"({VL}|{DIT})(attn1|ff)\..*", weights, rows)
     others = rf"model\.proj_out_2|state_encoder\..*|action_encoder\.W3|{DECODERS}\..*"
     assert round_group(reference, others, bfloat16, bfloat16)
@@ -252,7 +253,7 @@ def rms(values: NDArray[np.float64]) -> float:
     return float(np.sqrt(np.mean(np.square(values))))
 
 
-@pytest.mark.parametrize("precision", ["bfloat16", "int8"])
+@pytest.mark.parametrize("precision", ["bfloat16", "int8", "int4"])
 @pytest.mark.parametrize("kind", ["n1", "n1.6", "n1.7", "split-arms"])
 def test_errors_are_those_of_the_rounding(isa: str, kind: str, precision: str, tmp_path: Path) -> None:
     """As far from float64 as the same rounding in torch is, within a factor of 2 over many numbers."""
@@ -265,5 +266,5 @@ def test_errors_are_those_of_the_rounding(isa: str, kind: str, precision: str, t
         exact = reference(**inputs).numpy()
         emulated = rounded(reference, precision)(**inputs).numpy() - exact
     error = np.asarray(head(**arrays(inputs))) - exact
-    steps = 2 if precision == "int8" and isa in ("avx2", "avx512f") else 1
+    steps = 2 if precision in ("int8", "int4") and isa in ("avx2", "avx512f") else 1
     assert rms(emulated) / 2 <= rms(error) <= 2 * steps * rms(emulated)

@@ -29,7 +29,15 @@ pub(crate) fn read_tensors<'py>(
         let shape = checkpoint
             .shape(name)
             .expect("the name is one of the checkpoint's");
-        dict.set_item(&name[prefix.len()..], to_numpy(py, data, shape)?)?;
+        // Of int4 there are two weights in a byte.
+        let stored = shape.iter().product::<usize>();
+        let mut shape = shape.to_vec();
+        if let Some(width) = shape.last_mut()
+            && data.len() > stored
+        {
+            *width *= 2;
+        }
+        dict.set_item(&name[prefix.len()..], to_numpy(py, data, &shape)?)?;
     }
     Ok(dict)
 }

@@ -30,6 +30,7 @@ pub(crate) fn measure_peaks(py: Python<'_>, num_threads: usize) -> PyResult<Boun
             ("float32", Arithmetic::Float32),
             ("bfloat16", Arithmetic::Bfloat16),
             ("int8", Arithmetic::Int8),
+            ("int4", Arithmetic::Int4),
         ] {
             let rate = peak_or_raise(call(py, || {
                 Ok(peak::macs_per_second(isa, arithmetic, num_threads))

@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use numpy::{PyArrayDyn, PyReadonlyArrayDyn, PyUntypedArrayMethods};
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
-use saccade_vla::{ConvertOptions, Error, Float, Problem, ResizeOptions, RewriteOptions, Written};
+use saccade_vla::{ConvertOptions, Error, Float, Precision, Problem, ResizeOptions, RewriteOptions, Written};
 
 use crate::arrays::{Named, set_fields, to_numpy};
 use crate::detached::call;
@@ -72,9 +72,13 @@ fn written_dict<'py>(py: Python<'py>, written: &Written) -> PyResult<Bound<'py, 
 }
 
 #[pyfunction]
-pub(crate) fn quantize<'py>(py: Python<'py>, rewrite: PyRewrite) -> PyResult<Bound<'py, PyDict>> {
+pub(crate) fn quantize<'py>(
+    py: Python<'py>,
+    rewrite: PyRewrite,
+    to: Named<Precision>,
+) -> PyResult<Bound<'py, PyDict>> {
     let report = rewrite.run(py, |source, out, options, progress| {
-        saccade_vla::quantize(source, out, &options, progress)
+        saccade_vla::quantize(source, out, to.0, &options, progress)
     })?;
     let dict = written_dict(py, &report.written)?;
     set_fields!(dict, report;

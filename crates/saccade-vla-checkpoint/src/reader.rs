@@ -10,13 +10,13 @@ use safetensors::Dtype;
 use safetensors::tensor::TensorInfo;
 
 use crate::adapter::{refuse_adapter, refuse_use_peft};
-use crate::elements::{Elements, check_int8};
+use crate::elements::{Elements, check_quantized};
 use crate::error::{Error, Problem, Result, probe_allocation, reserve, show_shape};
 use crate::header::Header;
 use crate::index::WeightFiles;
 use crate::names::plain_name;
 use crate::source::SourceFile;
-use crate::spec::{self, SCALE_SUFFIX, TensorProblem, TensorSpec};
+use crate::spec::{self, SCALE_SUFFIX, TensorProblem, TensorSpec, is_quantized};
 use crate::{bail, problem};
 
 /// Bytes that are copied together.
@@ -147,10 +147,10 @@ impl Checkpoint {
         Some((entry.info.dtype, &entry.info.shape))
     }
 
-    /// Reads tensor `name` whole; int8 with its scales.
+    /// Reads tensor `name` whole; int8 and int4 (U8) with their scales.
     ///
     /// # Errors
-    /// [`Error::Checkpoint`] if there is no such tensor or its type is not F32, BF16, F16 or I8 with scales; [`Error::UnreadableTensor`] if the
+    /// [`Error::Checkpoint`] if there is no such tensor or its type is not F32, BF16, F16, or I8 or U8 with scales; [`Error::UnreadableTensor`] if the
     /// file cannot be read or has changed since it was opened; [`Error::Memory`] if there is no memory for the tensor.
     pub fn read(&self, name: &str) -> Result<Elements> {
         self.read_into(name, None, None)
@@ -169,7 +169,7 @@ impl Checkpoint {
     /// Reads the slices `wanted` of the first axis of tensor `name`.
     ///
     /// # Errors
-    /// As [`Checkpoint::read`], and if there are no such slices. int8 is read whole only.
+    /// As [`Checkpoint::read`], and if there are no such slices. int8 and int4 are read whole only.
     pub fn read_slices(&self, name: &str, wanted: Range<usize>) -> Result<Elements> {
         self.read_into(name, Some(wanted), None)
     }
@@ -184,8 +184,8 @@ impl Checkpoint {
     ) -> Result<Elements> {
         let entry = self.entry(name)?;
         let Some(wanted) = wanted else {
-            if entry.info.dtype == Dtype::I8 {
-                return self.read_int8(name, entry);
+            if is_quantized(entry.info.dtype) {
+                return self.read_quantized(name, entry);
             }
             let elements = entry.info.shape.iter().product();
             return self.read_elements(name, entry, 0, elements, spare);
@@ -312,19 +312,28 @@ impl Checkpoint {
         }
     }
 
-    fn read_int8(&self, name: &str, entry: &Entry) -> Result<Elements> {
+    fn read_quantized(&self, name: &str, entry: &Entry) -> Result<Elements> {
         let scale = format!("{name}{SCALE_SUFFIX}");
         let rows = entry.info.shape.first().copied().unwrap_or(1);
-        if let Some(problem) = spec::scale_problem(|name| self.describe(name), name, &scale, rows) {
+        let dtype = entry.info.dtype;
+        if let Some(problem) = spec::scale_problem(|name| self.describe(name), name, dtype, &scale, rows) {
             return Err(Error::Checkpoint(Problem::new("source", problem.text())));
         }
-        let values: Vec<i8> =
-            self.read_plain(name, entry, 0, entry.info.shape.iter().product(), Vec::new())?;
+        let count = entry.info.shape.iter().product();
         let scales = self
             .read_elements(&scale, self.entry(&scale)?, 0, rows, None)?
             .into_f32()?;
-        check_int8(name, &values, &scale, &scales)
-            .map_err(|problem| Error::Checkpoint(Problem::new("source", problem)))?;
+        let check = |bytes: &[u8], is_int4| {
+            check_quantized(name, bytes, is_int4, &scale, &scales)
+                .map_err(|problem| Error::Checkpoint(Problem::new("source", problem)))
+        };
+        if dtype == Dtype::U8 {
+            let values: Vec<u8> = self.read_plain(name, entry, 0, count, Vec::new())?;
+            check(&values, true)?;
+            return Ok(Elements::Int4 { values, scales });
+        }
+        let values: Vec<i8> = self.read_plain(name, entry, 0, count, Vec::new())?;
+        check(bytemuck::cast_slice(&values), false)?;
         Ok(Elements::Int8 { values, scales })
     }
 

@@ -6,7 +6,7 @@ use safetensors::Dtype;
 
 use crate::error::show_shape;
 
-/// What the name of a tensor's scales adds to its own: `X.weight` of int8 has `X.weight_scale`.
+/// What the name of a tensor's scales adds to its own: `X.weight` of int8 or int4 has `X.weight_scale`.
 pub const SCALE_SUFFIX: &str = "_scale";
 
 /// A tensor that a checkpoint must hold.
@@ -16,8 +16,8 @@ pub struct TensorSpec {
     pub name: String,
     /// Its shape.
     pub shape: Vec<usize>,
-    /// Whether it may be stored as int8 with a scale for each row.
-    pub may_be_int8: bool,
+    /// Whether it may be stored with a scale for each row: as int8 (I8), or as int4, two elements of a row in a byte (U8).
+    pub may_be_quantized: bool,
     /// Whether its first axis counts equal layers, of which a row of a batch uses one.
     pub is_stacked: bool,
 }
@@ -29,10 +29,27 @@ impl TensorSpec {
         Self {
             name: name.to_owned(),
             shape: shape.to_vec(),
-            may_be_int8: false,
+            may_be_quantized: false,
             is_stacked: false,
         }
     }
+
+    /// The shape that it has in a file of this type: of int4, rows of half as many bytes, rounded up.
+    #[must_use]
+    pub fn shape_as(&self, dtype: Dtype) -> Vec<usize> {
+        match self.shape.split_first() {
+            Some((&rows, rest)) if self.may_be_quantized && dtype == Dtype::U8 => {
+                vec![rows, rest.iter().product::<usize>().div_ceil(2)]
+            }
+            _ => self.shape.clone(),
+        }
+    }
+}
+
+/// Whether elements of this type are whole numbers that a scale for each row multiplies.
+#[must_use]
+pub fn is_quantized(dtype: Dtype) -> bool {
+    matches!(dtype, Dtype::I8 | Dtype::U8)
 }
 
 /// One thing that is wrong.
@@ -75,33 +92,36 @@ pub fn problems<'a>(
                 "{name} is missing, expected {}",
                 show_shape(&spec.shape)
             ))),
-            Some((_, shape)) if shape != spec.shape => problems.push(TensorProblem::Shape(format!(
-                "{name} has shape {}, expected {}",
-                show_shape(shape),
-                show_shape(&spec.shape)
-            ))),
-            Some((Dtype::I8, _)) if spec.may_be_int8 => {
+            Some((dtype, shape)) if shape != spec.shape_as(dtype) => {
+                problems.push(TensorProblem::Shape(format!(
+                    "{name} has shape {}, expected {}",
+                    show_shape(shape),
+                    show_shape(&spec.shape_as(dtype))
+                )));
+            }
+            Some((dtype, _)) if spec.may_be_quantized && is_quantized(dtype) => {
                 problems.extend(scale_problem(
                     &describe,
                     &name,
+                    dtype,
                     &scale,
                     spec.shape.first().copied().unwrap_or(1),
                 ));
                 known.insert(scale);
             }
             Some((dtype, _)) if !is_readable(dtype) => {
-                let int8 = if spec.may_be_int8 {
-                    ", or I8 with its scale"
+                let quantized = if spec.may_be_quantized {
+                    ", or I8 or U8 with its scale"
                 } else {
                     ""
                 };
                 problems.push(TensorProblem::Other(format!(
-                    "{name} is {dtype:?}, expected F32, BF16 or F16{int8}"
+                    "{name} is {dtype:?}, expected F32, BF16 or F16{quantized}"
                 )));
             }
-            Some((dtype, _)) if spec.may_be_int8 && describe(&scale).is_some() => {
+            Some((dtype, _)) if spec.may_be_quantized && describe(&scale).is_some() => {
                 problems.push(TensorProblem::Other(format!(
-                    "{scale} is there, but {name} is {dtype:?}, expected I8"
+                    "{scale} is there, but {name} is {dtype:?}, expected I8 or U8"
                 )));
                 known.insert(scale);
             }
@@ -118,23 +138,24 @@ pub fn problems<'a>(
     problems
 }
 
-/// What is wrong with the tensor `scale`, the scales of the int8 tensor `name` of `rows` rows.
+/// What is wrong with the tensor `scale`, the scales of the tensor `name` of this type and of `rows` rows.
 pub(crate) fn scale_problem<'a>(
     describe: impl Fn(&str) -> Option<(Dtype, &'a [usize])>,
     name: &str,
+    dtype: Dtype,
     scale: &str,
     rows: usize,
 ) -> Option<TensorProblem> {
     match describe(scale) {
         None => Some(TensorProblem::Other(format!(
-            "{name} is I8 and {scale} is missing, expected ({rows},)"
+            "{name} is {dtype:?} and {scale} is missing, expected ({rows},)"
         ))),
         Some((_, shape)) if shape != [rows] => Some(TensorProblem::Shape(format!(
             "{scale} has shape {}, expected ({rows},)",
             show_shape(shape)
         ))),
-        Some((dtype, _)) if dtype != Dtype::F32 => Some(TensorProblem::Other(format!(
-            "{scale} is {dtype:?}, expected F32"
+        Some((of_scale, _)) if of_scale != Dtype::F32 => Some(TensorProblem::Other(format!(
+            "{scale} is {of_scale:?}, expected F32"
         ))),
         Some(_) => None,
     }

@@ -19,7 +19,8 @@ fn main() -> Result<(), Box<dyn Error>> {
         "float32" => Arithmetic::Float32,
         "bfloat16" => Arithmetic::Bfloat16,
         "int8" => Arithmetic::Int8,
-        _ => return Err("ARITHMETIC: expected float32, bfloat16 or int8".into()),
+        "int4" => Arithmetic::Int4,
+        _ => return Err("ARITHMETIC: expected float32, bfloat16, int8 or int4".into()),
     };
     let numbers: Vec<usize> = numbers
         .iter()

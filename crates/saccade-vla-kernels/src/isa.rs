@@ -45,10 +45,10 @@ pub const ISA_VARIABLE: &str = "SACCADE_ISA";
 
 /// A product that is made of vectors, unless the instruction set has its own ones.
 macro_rules! of_vectors_unless {
-    ([] $product:ty) => {
-        available::<$product>()
+    ([] $product:ty, $weights:ident) => {
+        available::<$product>($weights)
     };
-    ([$own:ty] $product:ty) => {
+    ([$own:ty] $product:ty, $weights:ident) => {
         None
     };
 }
@@ -62,7 +62,7 @@ macro_rules! of_vectors_unless {
 ///   `vectors`; with `where` a condition, where it holds: on Intel's Sapphire Rapids products of float32 have
 ///   twice the rate of those of bfloat16;
 /// - `gemm_bf16`, `gemm_int8`: products with packed weights of these elements, likewise; those after the last
-///   one listed are made of `vectors` alone;
+///   one listed are made of `vectors` alone; int4 has those of int8;
 /// - `needs`: of these types, the CPU must have at least one;
 /// - `gemm_f32`, `gemm_widened`: float32 rows with float32 weights, and with bfloat16 ones, where these
 ///   products are not made of `vectors` either; then no product is.
@@ -192,15 +192,15 @@ macro_rules! instruction_sets {
             pub(crate) fn gemm(self, arithmetic: Arithmetic, weights: Element) -> Box<dyn Gemm> {
                 let found: Option<Box<dyn Gemm>> = match self {
                     $(#[cfg($condition)] Self::$isa if self.is_available() => match (arithmetic, weights) {
-                        (Arithmetic::Float32, Element::Bf16) => None $(.or_else(available::<$gemm_widened>))?
-                            .or_else(|| of_vectors_unless!([$($gemm_f32)?] InVectors<$vectors, WidenedBf16>)),
-                        (Arithmetic::Float32, _) => None $(.or_else(available::<$gemm_f32>))?
-                            .or_else(|| of_vectors_unless!([$($gemm_f32)?] InVectors<$vectors, F32>)),
+                        (Arithmetic::Float32, Element::Bf16) => None $(.or_else(|| available::<$gemm_widened>(weights)))?
+                            .or_else(|| of_vectors_unless!([$($gemm_f32)?] InVectors<$vectors, WidenedBf16>, weights)),
+                        (Arithmetic::Float32, _) => None $(.or_else(|| available::<$gemm_f32>(weights)))?
+                            .or_else(|| of_vectors_unless!([$($gemm_f32)?] InVectors<$vectors, F32>, weights)),
                         (Arithmetic::Bfloat16, _) => None
-                            $(.or_else(|| (true $(&& $gemm_is_fast)?).then(available::<$gemm_bf16>).flatten()))*
-                            .or_else(|| of_vectors_unless!([$($gemm_f32)?] InVectors<$vectors, RoundedBf16>)),
-                        (Arithmetic::Int8, _) => None $(.or_else(available::<$gemm_int8>))*
-                            .or_else(|| of_vectors_unless!([$($gemm_f32)?] InVectors<$vectors, Int8>)),
+                            $(.or_else(|| (true $(&& $gemm_is_fast)?).then(|| available::<$gemm_bf16>(weights)).flatten()))*
+                            .or_else(|| of_vectors_unless!([$($gemm_f32)?] InVectors<$vectors, RoundedBf16>, weights)),
+                        (Arithmetic::Int8 | Arithmetic::Int4, _) => None $(.or_else(|| available::<$gemm_int8>(weights)))*
+                            .or_else(|| of_vectors_unless!([$($gemm_f32)?] InVectors<$vectors, Int8>, weights)),
                     },)+
                     _ => None,
                 };

@@ -4,7 +4,7 @@
 //!
 //! [`Isa`] names an instruction set and finds the best one; every kernel takes one, or packs weights for one. Matrices are [`Rows`] and
 //! [`RowsMut`], views with a row stride. [`PackedLinear`] is the linear layer, [`PackedKeyValues`] the KV cache of [`attention`], and
-//! [`quantize_rows`] the rule of int8 weights. [`layer_norm`], [`rms_norm`], [`rotary_embedding`] and the activations work on rows;
+//! [`quantize_rows`] the rule of int8 weights, [`quantize_rows_int4`] of int4. [`layer_norm`], [`rms_norm`], [`rotary_embedding`] and the activations work on rows;
 //! [`resize_area`] and its neighbours on images, bit for bit as OpenCV, Pillow and torch do.
 //!
 //! Memory whose size the caller decides is claimed with an error, [`AllocError`], where there is none. [`parallel_for`] runs on the pool,
@@ -64,4 +64,4 @@ pub use pool::{
 pub use rotary::rotary_embedding;
 pub use rows::{Rows, RowsMut};
 pub use threads::{NUM_THREADS_VARIABLE, NumThreadsError, default_num_threads};
-pub use weights::{Arithmetic, Element, WeightRef, quantize_rows};
+pub use weights::{Arithmetic, Element, WeightRef, quantize_rows, quantize_rows_int4};

@@ -12,7 +12,7 @@ use crate::aligned::{AlignedBuffer, AllocError};
 use crate::isa::Isa;
 use crate::pool::has_room_for_thread;
 use crate::simd::{Kernel, Simd};
-use crate::weights::{Arithmetic, Element};
+use crate::weights::Arithmetic;
 
 /// Calls of which the fastest counts: what disturbs a machine makes some of them slow, never fast.
 const CALLS: usize = 10;
@@ -70,7 +70,7 @@ pub fn macs_per_second(isa: Isa, arithmetic: Arithmetic, threads: usize) -> Resu
 /// # Panics
 /// As [`macs_per_second`].
 pub fn multiply_accumulate(isa: Isa, arithmetic: Arithmetic, threads: usize) -> Result<usize, PeakError> {
-    let gemm = isa.gemm(arithmetic, Element::F32);
+    let gemm = isa.gemm(arithmetic, arithmetic.element());
     on_threads(threads, &|_| gemm.multiply_for_peak())
 }
 
@@ -80,7 +80,7 @@ pub fn multiply_accumulate(isa: Isa, arithmetic: Arithmetic, threads: usize) -> 
 /// If this CPU lacks `isa`.
 #[must_use]
 pub fn kernel_name(isa: Isa, arithmetic: Arithmetic) -> &'static str {
-    isa.gemm(arithmetic, Element::F32).name()
+    isa.gemm(arithmetic, arithmetic.element()).name()
 }
 
 /// Bytes a second that `threads` threads read from memory together, each of them as `streams` streams: a few

@@ -211,7 +211,12 @@ fn bits_of_a_column_do_not_depend_on_how_many_follow() {
     let (weight, bias) = (numbers(1, inputs * outputs, 1.0), numbers(2, outputs, 1.0));
     let x = numbers(3, row_count * inputs, 1.0);
     for isa in isas() {
-        for arithmetic in [Arithmetic::Float32, Arithmetic::Bfloat16, Arithmetic::Int8] {
+        for arithmetic in [
+            Arithmetic::Float32,
+            Arithmetic::Bfloat16,
+            Arithmetic::Int8,
+            Arithmetic::Int4,
+        ] {
             let first = |count: usize| {
                 let layer = common::linear::pack(isa, arithmetic, &weight[..count * inputs], &bias[..count]);
                 apply(&layer, 1, &x, Epilogue::GeluTanh)

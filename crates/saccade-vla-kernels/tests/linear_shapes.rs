@@ -2,11 +2,12 @@
 
 mod common;
 
+use common::linear::pack;
 use common::{isas, rows, rows_mut};
 use half::bf16;
 use saccade_vla_kernels::{
-    Arithmetic, Element, Epilogue, Isa, KernelError, LinearScratch, Matrix, PackedLinear, Rows, WeightRef,
-    quantize_rows,
+    Arithmetic, Element, Epilogue, Isa, KernelError, LinearScratch, Matrix, PackedLinear, Rows, RowsMut,
+    WeightRef, quantize_rows,
 };
 
 /// Four inputs, four outputs.
@@ -86,7 +87,12 @@ fn the_size_of_a_packed_layer_is_known_before_packing() {
             let bf16 = vec![bf16::ONE; outputs * inputs];
             let f32 = WeightRef::F32(Matrix::from(Rows::strided(&f32, outputs, inputs, inputs)));
             let bf16 = WeightRef::Bf16(Matrix::from(Rows::strided(&bf16, outputs, inputs, inputs)));
-            for arithmetic in [Arithmetic::Float32, Arithmetic::Bfloat16, Arithmetic::Int8] {
+            for arithmetic in [
+                Arithmetic::Float32,
+                Arithmetic::Bfloat16,
+                Arithmetic::Int8,
+                Arithmetic::Int4,
+            ] {
                 for (weight, element) in [(f32, Element::F32), (bf16, Element::Bf16)] {
                     let layer = PackedLinear::pack(isa, arithmetic, 1, &[(weight, None)]).unwrap();
                     let nbytes = PackedLinear::packed_nbytes(isa, arithmetic, element, (outputs, inputs));
@@ -95,8 +101,10 @@ fn the_size_of_a_packed_layer_is_known_before_packing() {
                 }
             }
         }
-        let wide = PackedLinear::packed_nbytes(isa, Arithmetic::Int8, Element::F32, (1, 65537));
-        assert!(matches!(wide, Err(KernelError::TooManyInputs { given: 65537 })));
+        for arithmetic in [Arithmetic::Int8, Arithmetic::Int4] {
+            let wide = PackedLinear::packed_nbytes(isa, arithmetic, Element::F32, (1, 65537));
+            assert!(matches!(wide, Err(KernelError::TooManyInputs { given: 65537 })));
+        }
     }
 }
 
@@ -106,7 +114,12 @@ fn a_layer_without_inputs_gives_its_bias() {
     // Rows without elements, as far apart as they like.
     let x = Rows::strided(&[], 4, 0, 1 << (usize::BITS * 5 / 8));
     for isa in isas() {
-        for arithmetic in [Arithmetic::Float32, Arithmetic::Bfloat16, Arithmetic::Int8] {
+        for arithmetic in [
+            Arithmetic::Float32,
+            Arithmetic::Bfloat16,
+            Arithmetic::Int8,
+            Arithmetic::Int4,
+        ] {
             let parts = [(weight, Some(&[1.0, 2.0, 3.0][..]))];
             let layer = PackedLinear::pack(isa, arithmetic, 1, &parts).unwrap();
             let mut out = vec![7.0; 12];
@@ -125,10 +138,15 @@ fn inputs_whose_panel_wraps_are_refused() {
     for inputs in [usize::MAX / 64 + 1, usize::MAX / 2, usize::MAX] {
         let weight = WeightRef::F32(Matrix::from(Rows::strided(&[1.0], inputs, 1, 0)).transpose());
         for isa in isas() {
-            for arithmetic in [Arithmetic::Float32, Arithmetic::Bfloat16, Arithmetic::Int8] {
+            for arithmetic in [
+                Arithmetic::Float32,
+                Arithmetic::Bfloat16,
+                Arithmetic::Int8,
+                Arithmetic::Int4,
+            ] {
                 let packed = PackedLinear::pack(isa, arithmetic, 1, &[(weight, None)]);
                 let size = PackedLinear::packed_nbytes(isa, arithmetic, Element::F32, (1, inputs));
-                if arithmetic == Arithmetic::Int8 {
+                if matches!(arithmetic, Arithmetic::Int8 | Arithmetic::Int4) {
                     assert!(matches!(packed, Err(KernelError::TooManyInputs { .. })));
                     assert!(matches!(size, Err(KernelError::TooManyInputs { .. })));
                 } else {
@@ -147,4 +165,43 @@ fn quantising_weights_whose_size_wraps_panics() {
     let inputs = usize::MAX / 4 + 1;
     let weight = WeightRef::F32(Matrix::from(Rows::strided(&[1.0; 4], inputs, 4, 0)).transpose());
     quantize_rows(weight, &mut [], &mut [0.0; 4]);
+}
+
+#[test]
+fn sizes_of_zero_are_fine() {
+    for isa in isas() {
+        for arithmetic in [
+            Arithmetic::Float32,
+            Arithmetic::Bfloat16,
+            Arithmetic::Int8,
+            Arithmetic::Int4,
+        ] {
+            let weight =
+                |outputs, inputs| WeightRef::F32(Matrix::from(Rows::strided(&[], outputs, inputs, inputs)));
+            let no_inputs =
+                PackedLinear::pack(isa, arithmetic, 1, &[(weight(3, 0), Some(&[1.0, 2.0, 3.0]))]).unwrap();
+            let mut out = [0.0; 6];
+            let x = Rows::strided(&[], 2, 0, 0);
+            let mut scratch = LinearScratch::new();
+            no_inputs
+                .apply(1, x, Epilogue::Store, rows_mut(&mut out, 3), &mut scratch)
+                .unwrap();
+            assert_eq!(out, [1.0, 2.0, 3.0, 1.0, 2.0, 3.0], "{isa}, {arithmetic:?}");
+            let no_outputs = PackedLinear::pack(isa, arithmetic, 1, &[(weight(0, 5), None)]).unwrap();
+            let nowhere = RowsMut::strided(&mut [], 1, 0, 0);
+            no_outputs
+                .apply(1, rows(&[1.0; 5], 5), Epilogue::Store, nowhere, &mut scratch)
+                .unwrap();
+            let layer = pack(isa, arithmetic, &[1.0; 6], &[0.0; 2]);
+            layer
+                .apply(
+                    1,
+                    rows(&[], 3),
+                    Epilogue::Store,
+                    rows_mut(&mut [], 2),
+                    &mut scratch,
+                )
+                .unwrap();
+        }
+    }
 }

@@ -53,15 +53,16 @@ const MORE: libc::rlim_t = 16 << 20;
 #[test]
 fn packing_weights_without_memory_is_an_error() {
     const OUTPUTS: usize = 1 << 16;
-    for (arithmetic, bytes) in [
-        (Arithmetic::Float32, 4),
-        (Arithmetic::Bfloat16, 2),
-        (Arithmetic::Int8, 1),
+    for (arithmetic, bits) in [
+        (Arithmetic::Float32, 32),
+        (Arithmetic::Bfloat16, 16),
+        (Arithmetic::Int8, 8),
+        (Arithmetic::Int4, 4),
     ] {
         assert!(limited(MORE, || {
             let part = (WeightRef::F32(Matrix::from(repeated(OUTPUTS))), None);
             let packed = PackedLinear::pack(Isa::best(), arithmetic, 1, &[part]);
-            matches!(packed, Err(KernelError::Alloc(error)) if error.bytes >= bytes * OUTPUTS * WIDTH)
+            matches!(packed, Err(KernelError::Alloc(error)) if error.bytes >= bits * OUTPUTS * WIDTH / 8)
         }));
     }
 }

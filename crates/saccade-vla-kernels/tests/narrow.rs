@@ -1,16 +1,19 @@
-//! The packed linear layer in bf16 and int8: against the exact product of the rounded or quantised operands, on every instruction set.
+//! The packed linear layer in bf16, int8 and int4: against the exact product of the rounded or quantised operands, on every instruction set.
 
 mod common;
 
-use common::linear::{apply, pack};
+use common::linear::{apply, int4, int4_bytes, pack};
 use common::{Strided, assert_close, bits, gamma, is_emulated, isas, numbers, rows, rows_mut};
 use half::bf16;
 use proptest::prelude::*;
 use saccade_vla_kernels::{
-    Arithmetic, Epilogue, Isa, KernelError, LinearScratch, Matrix, PackedLinear, Rows, RowsMut, WeightRef,
+    Arithmetic, Epilogue, Isa, KernelError, LinearScratch, Matrix, PackedLinear, WeightRef,
 };
 
-const NARROW: [Arithmetic; 2] = [Arithmetic::Bfloat16, Arithmetic::Int8];
+const NARROW: [Arithmetic; 3] = [Arithmetic::Bfloat16, Arithmetic::Int8, Arithmetic::Int4];
+
+/// Those whose sums are whole numbers.
+const QUANTIZED: [Arithmetic; 2] = [Arithmetic::Int8, Arithmetic::Int4];
 
 /// The values that an operand has after rounding or quantisation, in float64.
 struct Operand {
@@ -42,6 +45,16 @@ impl Operand {
             }));
         }
         Self { values: all }
+    }
+
+    /// Weights in int4, by the rule that `narrow_weights` tests.
+    fn weight_int4(values: &[f32], inputs: usize) -> Self {
+        let (pairs, scales) = int4(values, inputs);
+        let wide = int4_bytes(&pairs, inputs).into_iter().enumerate();
+        let values = wide.map(|(index, value)| f64::from(value) * f64::from(scales[index / inputs]));
+        Self {
+            values: values.collect(),
+        }
     }
 
     /// Activations in bytes up to `steps`, by the definition.
@@ -106,6 +119,11 @@ impl<'a> Exact<'a> {
                 Operand::rounded(self.weight),
                 2 * self.inputs + 2,
             ),
+            Arithmetic::Int4 => (
+                Operand::bytes(self.x, self.inputs, steps),
+                Operand::weight_int4(self.weight, self.inputs),
+                5,
+            ),
             _ => (
                 Operand::bytes(self.x, self.inputs, steps),
                 Operand::weight(self.weight, self.inputs),
@@ -120,7 +138,7 @@ impl<'a> Exact<'a> {
                     sum += x * weight;
                     magnitude += (x * weight).abs();
                 }
-                if arithmetic == Arithmetic::Int8 {
+                if arithmetic != Arithmetic::Bfloat16 {
                     magnitude = sum.abs();
                 }
                 magnitude += f64::from(bias).abs();
@@ -208,32 +226,38 @@ fn the_largest_sums_do_not_overflow() {
         let weight = vec![sign; inputs];
         let mut exact = Exact::new(&x, &weight, &[0.0], inputs);
         for isa in isas() {
-            let layer = pack(isa, Arithmetic::Int8, &weight, &[0.0]);
-            exact.check(isa, Arithmetic::Int8, &apply(&layer, 1, &x, Epilogue::Store));
+            for arithmetic in QUANTIZED {
+                let layer = pack(isa, arithmetic, &weight, &[0.0]);
+                exact.check(isa, arithmetic, &apply(&layer, 1, &x, Epilogue::Store));
+            }
         }
     }
     let weight = vec![0.0; inputs + 1];
     let weight = WeightRef::F32(Matrix::new(&weight, inputs + 1));
-    let packed = PackedLinear::pack(Isa::best(), Arithmetic::Int8, 1, &[(weight, None)]);
-    assert!(matches!(packed, Err(KernelError::TooManyInputs { given }) if given == inputs + 1));
+    for arithmetic in QUANTIZED {
+        let packed = PackedLinear::pack(Isa::best(), arithmetic, 1, &[(weight, None)]);
+        assert!(matches!(packed, Err(KernelError::TooManyInputs { given }) if given == inputs + 1));
+    }
 }
 
 #[test]
-fn int8_has_the_bits_of_portable_where_bytes_are_as_large() {
+fn sums_of_bytes_have_the_bits_of_portable_where_bytes_are_as_large() {
     for (inputs, outputs, rows) in [(1, 1, 1), (37, 25, 9), (1030, 70, 30)] {
         let x = numbers(31, rows * inputs, 3.0);
         let weight = numbers(32, outputs * inputs, 0.1);
         let bias = numbers(33, outputs, 1.0);
-        let out = |isa| {
-            let layer = pack(isa, Arithmetic::Int8, &weight, &bias);
-            bits(&apply(&layer, 1, &x, Epilogue::Add))
-        };
-        let expected = out(Isa::Portable);
-        for isa in Isa::available() {
-            assert!(
-                steps(isa) < 255.0 || out(isa) == expected,
-                "{isa}, {inputs} x {outputs}"
-            );
+        for arithmetic in QUANTIZED {
+            let out = |isa| {
+                let layer = pack(isa, arithmetic, &weight, &bias);
+                bits(&apply(&layer, 1, &x, Epilogue::Add))
+            };
+            let expected = out(Isa::Portable);
+            for isa in Isa::available() {
+                assert!(
+                    steps(isa) < 255.0 || out(isa) == expected,
+                    "{isa}, {arithmetic:?}, {inputs} x {outputs}"
+                );
+            }
         }
     }
 }
@@ -348,8 +372,10 @@ fn rows_of_any_size_keep_to_the_bound() {
         }
     }
     for isa in isas() {
-        let tiny = pack(isa, Arithmetic::Int8, &vec![1e-44; 3 * inputs], &[1.0; 3]);
-        assert_eq!(apply(&tiny, 1, &vec![5.0; inputs], Epilogue::Store), [1.0; 3]);
+        for arithmetic in QUANTIZED {
+            let tiny = pack(isa, arithmetic, &vec![1e-44; 3 * inputs], &[1.0; 3]);
+            assert_eq!(apply(&tiny, 1, &vec![5.0; inputs], Epilogue::Store), [1.0; 3]);
+        }
     }
 }
 
@@ -388,7 +414,7 @@ fn nan_and_infinity_stay_in_their_row() {
                                     expected[row * outputs..][..outputs],
                                     "{isa}, {arithmetic:?}"
                                 );
-                            } else if poison.is_nan() || arithmetic == Arithmetic::Int8 {
+                            } else if poison.is_nan() || QUANTIZED.contains(&arithmetic) {
                                 assert!(
                                     part.iter().all(|value| value.is_nan()),
                                     "{isa}, {arithmetic:?}, {poison}"
@@ -398,40 +424,6 @@ fn nan_and_infinity_stay_in_their_row() {
                     }
                 }
             }
-        }
-    }
-}
-
-#[test]
-fn sizes_of_zero_are_fine() {
-    for isa in isas() {
-        for arithmetic in [Arithmetic::Float32, Arithmetic::Bfloat16, Arithmetic::Int8] {
-            let weight =
-                |outputs, inputs| WeightRef::F32(Matrix::from(Rows::strided(&[], outputs, inputs, inputs)));
-            let no_inputs =
-                PackedLinear::pack(isa, arithmetic, 1, &[(weight(3, 0), Some(&[1.0, 2.0, 3.0]))]).unwrap();
-            let mut out = [0.0; 6];
-            let x = Rows::strided(&[], 2, 0, 0);
-            let mut scratch = LinearScratch::new();
-            no_inputs
-                .apply(1, x, Epilogue::Store, rows_mut(&mut out, 3), &mut scratch)
-                .unwrap();
-            assert_eq!(out, [1.0, 2.0, 3.0, 1.0, 2.0, 3.0], "{isa}, {arithmetic:?}");
-            let no_outputs = PackedLinear::pack(isa, arithmetic, 1, &[(weight(0, 5), None)]).unwrap();
-            let nowhere = RowsMut::strided(&mut [], 1, 0, 0);
-            no_outputs
-                .apply(1, rows(&[1.0; 5], 5), Epilogue::Store, nowhere, &mut scratch)
-                .unwrap();
-            let layer = pack(isa, arithmetic, &[1.0; 6], &[0.0; 2]);
-            layer
-                .apply(
-                    1,
-                    rows(&[], 3),
-                    Epilogue::Store,
-                    rows_mut(&mut [], 2),
-                    &mut scratch,
-                )
-                .unwrap();
         }
     }
 }

@@ -51,7 +51,13 @@ fn the_second_call_of_a_shape_allocates_nothing() {
     for isa in isas() {
         let weight = WeightRef::F32(Matrix::new(&weight, WIDTH));
         let pack = |arithmetic| PackedLinear::pack(isa, arithmetic, 1, &[(weight, None)]).unwrap();
-        let layers = [Arithmetic::Float32, Arithmetic::Bfloat16, Arithmetic::Int8].map(pack);
+        let layers = [
+            Arithmetic::Float32,
+            Arithmetic::Bfloat16,
+            Arithmetic::Int8,
+            Arithmetic::Int4,
+        ]
+        .map(pack);
         let mut scratch = LinearScratch::new();
         let mut held = PackedKeyValues::new(isa, Element::F32, 8, WIDTH / 8);
         let mut appended = PackedKeyValues::new(isa, Element::Bf16, 8, WIDTH / 8);

@@ -1,4 +1,4 @@
-//! int8 layers that keep outliers apart: against float64 on every instruction set, and the bits that must not change.
+//! int8 and int4 layers that keep outliers apart: against float64 on every instruction set, and the bits that must not change.
 
 mod common;
 

@@ -6,8 +6,13 @@ use saccade_vla_kernels::{Arithmetic, Isa};
 #[test]
 fn every_peak_counts_its_work() {
     for isa in Isa::available() {
-        let [float, bf16, int8] = [Arithmetic::Float32, Arithmetic::Bfloat16, Arithmetic::Int8]
-            .map(|arithmetic| multiply_accumulate(isa, arithmetic, 1).unwrap());
+        let [float, bf16, int8, int4] = [
+            Arithmetic::Float32,
+            Arithmetic::Bfloat16,
+            Arithmetic::Int8,
+            Arithmetic::Int4,
+        ]
+        .map(|arithmetic| multiply_accumulate(isa, arithmetic, 1).unwrap());
         // A step does so many 28th of the multiply-adds of one of float32.
         let expected = match (isa, &isa.dot_products()[..]) {
             // Six products of 16 x 16 x 16 words next to a dozen of vectors, in an eighth of the steps.
@@ -24,6 +29,7 @@ fn every_peak_counts_its_work() {
             _ => [28, 28 * 4],
         };
         assert_eq!([28 * bf16 / float, 28 * int8 / float], expected, "{isa}");
+        assert_eq!(int4, int8, "{isa}: weights of four bits are multiplied as bytes");
         assert_eq!(
             multiply_accumulate(isa, Arithmetic::Float32, 2).unwrap(),
             2 * float,

@@ -83,13 +83,15 @@ impl Case {
 }
 
 #[test]
-fn software_tiles_of_int8_have_the_bits_of_portable() {
+fn software_tiles_of_bytes_have_the_bits_of_portable() {
     for shape in SHAPES {
         let case = Case::new(shape);
         for epilogue in EPILOGUES {
-            let [tiles, portable] =
-                [TILES, Isa::Portable].map(|isa| bits(&case.run(isa, Arithmetic::Int8, epilogue)));
-            assert!(tiles == portable, "{shape:?}, {epilogue:?}");
+            for arithmetic in [Arithmetic::Int8, Arithmetic::Int4] {
+                let [tiles, portable] =
+                    [TILES, Isa::Portable].map(|isa| bits(&case.run(isa, arithmetic, epilogue)));
+                assert!(tiles == portable, "{shape:?}, {arithmetic:?}, {epilogue:?}");
+            }
         }
     }
 }
@@ -122,7 +124,7 @@ fn software_tiles_of_bf16_agree_with_float64() {
 fn software_tiles_give_equal_bits_in_any_batch_and_on_any_threads() {
     for shape in [(49, 130, 95), (37, 2100, 70), (340, 70, 50)] {
         let case = Case::new(shape);
-        for arithmetic in [Arithmetic::Bfloat16, Arithmetic::Int8] {
+        for arithmetic in [Arithmetic::Bfloat16, Arithmetic::Int8, Arithmetic::Int4] {
             let layer = case.layer(TILES, arithmetic);
             let whole = bits(&case.apply(&layer, 1, &case.x, Epilogue::Store));
             for threads in [2, 3, 7] {
@@ -147,7 +149,12 @@ fn software_tiles_give_equal_bits_in_any_batch_and_on_any_threads() {
 fn software_tiles_give_equal_bits_with_and_without_streams() {
     let case = Case::new((49, 2100, 70));
     for isa in common::isas() {
-        for arithmetic in [Arithmetic::Float32, Arithmetic::Bfloat16, Arithmetic::Int8] {
+        for arithmetic in [
+            Arithmetic::Float32,
+            Arithmetic::Bfloat16,
+            Arithmetic::Int8,
+            Arithmetic::Int4,
+        ] {
             let [on, off] = [true, false].map(|streams| {
                 let layer = case.layer(isa, arithmetic).with_streams(streams);
                 bits(&case.apply(&layer, 2, &case.x, Epilogue::Store))
@@ -162,7 +169,7 @@ fn software_tiles_give_equal_bits_with_and_without_streams() {
 fn software_tiles_do_not_see_what_a_scratch_held() {
     let case = Case::new((20, 33, 50));
     let mut scratch = LinearScratch::new();
-    for arithmetic in [Arithmetic::Bfloat16, Arithmetic::Int8] {
+    for arithmetic in [Arithmetic::Bfloat16, Arithmetic::Int8, Arithmetic::Int4] {
         let layer = case.layer(TILES, arithmetic);
         let expected = bits(&case.apply(&layer, 1, &case.x, Epilogue::Store));
         let wide = Case::new((40, 97, 10));
@@ -236,7 +243,7 @@ fn hardware_tiles_have_the_bits_of_software_tiles() {
     }
     for shape in SHAPES {
         let case = Case::new(shape);
-        for arithmetic in [Arithmetic::Bfloat16, Arithmetic::Int8] {
+        for arithmetic in [Arithmetic::Bfloat16, Arithmetic::Int8, Arithmetic::Int4] {
             let [amx, software] =
                 [Isa::Amx, TILES].map(|isa| bits(&case.run(isa, arithmetic, Epilogue::Store)));
             assert!(amx == software, "{shape:?}, {arithmetic:?}");

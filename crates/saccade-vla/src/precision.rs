@@ -21,13 +21,13 @@ pub(crate) enum Role {
 }
 
 impl Role {
-    /// True for large weights: they may be stored as int8, and the memory that they are read into is used
+    /// True for large weights: they may be stored as int8 or int4, and the memory that they are read into is used
     /// again.
     pub(crate) fn is_given_back(self) -> bool {
         matches!(self, Self::Block | Self::BackboneBlock)
     }
 
-    /// True if in int8 the elements of a row that are far larger than the others are multiplied in float32.
+    /// True if in int8 and int4 the elements of a row that are far larger than the others are multiplied in float32.
     /// Vision towers and language models have such channels: in the residual stream, and most of all before
     /// the second layer of a feed-forward. The action head has none, and keeps its bits.
     pub(crate) fn keeps_outliers(self) -> bool {
@@ -48,9 +48,16 @@ pub enum Precision {
     /// The linear layers of the blocks in int8: weights with one scale for each output, inputs with one for
     /// each row. The rest as in [`Precision::Bfloat16`].
     Int8,
+    /// The same with weights of four bits.
+    Int4,
 }
 
-const ALL: [Precision; 3] = [Precision::Float32, Precision::Bfloat16, Precision::Int8];
+const ALL: [Precision; 4] = [
+    Precision::Float32,
+    Precision::Bfloat16,
+    Precision::Int8,
+    Precision::Int4,
+];
 
 impl Precision {
     /// The arithmetic of a linear layer.
@@ -58,6 +65,7 @@ impl Precision {
         match (self, role) {
             (Self::Float32, _) | (_, Role::Time) => Arithmetic::Float32,
             (Self::Int8, Role::Block | Role::BackboneBlock) => Arithmetic::Int8,
+            (Self::Int4, Role::Block | Role::BackboneBlock) => Arithmetic::Int4,
             (Self::Bfloat16, _) | (_, Role::Other) => Arithmetic::Bfloat16,
         }
     }
@@ -71,14 +79,19 @@ impl Precision {
     /// takes 0.31 GB, not 0.62, and its rows have a relative error of 0.8 %, where the features of int8 have
     /// one of 3 %.
     pub(crate) fn quantizes_tables(self) -> bool {
-        self == Self::Int8
+        self.quantizes()
+    }
+
+    /// True if weights of the blocks are whole numbers times a scale of each output.
+    pub(crate) fn quantizes(self) -> bool {
+        matches!(self, Self::Int8 | Self::Int4)
     }
 
     /// The type of KV caches.
     pub(crate) fn keys_values(self) -> Element {
         match self {
             Self::Float32 => Element::F32,
-            Self::Bfloat16 | Self::Int8 => Element::Bf16,
+            Self::Bfloat16 | Self::Int8 | Self::Int4 => Element::Bf16,
         }
     }
 }
@@ -89,6 +102,7 @@ impl fmt::Display for Precision {
             Self::Float32 => "float32",
             Self::Bfloat16 => "bfloat16",
             Self::Int8 => "int8",
+            Self::Int4 => "int4",
         })
     }
 }

@@ -6,8 +6,8 @@ use std::path::PathBuf;
 use std::time::Duration;
 
 use saccade_vla::{
-    ActionHead, ConvertOptions, Error, HeadConfig, LoadOptions, ResizeOptions, Result, RewriteOptions,
-    convert, interruptible, merge_future_tokens, quantize, resize, tensor_shapes,
+    ActionHead, ConvertOptions, Error, HeadConfig, LoadOptions, Precision, ResizeOptions, Result,
+    RewriteOptions, convert, interruptible, merge_future_tokens, quantize, resize, tensor_shapes,
 };
 
 /// A released head and its config, which is in the file's metadata.
@@ -57,9 +57,10 @@ fn rewriting_stops_within_a_tensor_and_writes_nothing() {
     };
     let resize_options = ResizeOptions::new(rewrite.clone(), 40);
     type Rewrite<'a> = &'a dyn Fn(&mut dyn FnMut()) -> Result<()>;
-    let rewrites: [Rewrite<'_>; 3] = [
+    let rewrites: [Rewrite<'_>; 4] = [
         &|after| convert(&path, &out, &convert_options, |_, _| (after(), true).1).map(drop),
-        &|after| quantize(&path, &out, &rewrite, |_, _| (after(), true).1).map(drop),
+        &|after| quantize(&path, &out, Precision::Int8, &rewrite, |_, _| (after(), true).1).map(drop),
+        &|after| quantize(&path, &out, Precision::Int4, &rewrite, |_, _| (after(), true).1).map(drop),
         &|after| resize(&path, &out, &resize_options, |_, _| (after(), true).1).map(drop),
     ];
     for rewrite in rewrites {

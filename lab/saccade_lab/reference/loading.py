@@ -13,7 +13,7 @@ from torch import Tensor
 from saccade.checkpoints.description import Description, describe
 from saccade.errors import CheckpointError
 
-# The name of an int8 weight with this suffix is that of its scales, one for each row.
+# The name of an int8 or int4 weight with this suffix is that of its scales, one for each row.
 SCALE_SUFFIX = "_scale"
 
 
@@ -36,12 +36,18 @@ def tensor_names(checkpoint: Description) -> list[str]:
     return [name.removeprefix(prefix) for name in names if name.startswith(prefix)]
 
 
+def int4_values(pairs: Tensor) -> Tensor:
+    """The int8 integers `(rows, 2 * width)` of `pairs (rows, width)` uint8: the low four bits come first."""
+    nibbles = torch.stack((pairs & 15, pairs >> 4), dim=-1).flatten(1).to(torch.int8)
+    return (nibbles ^ 8) - 8
+
+
 def read_tensors(
     checkpoint: Description, expected: Mapping[str, torch.Size], dtype: torch.dtype
 ) -> dict[str, Tensor]:
     """Reads the head's tensors in ``dtype``, by their names without prefix.
 
-    int8 weights are multiplied by their scales.
+    int8 and int4 weights are multiplied by their scales.
 
     Raises:
         CheckpointError: Tensors are missing, unknown inside the prefix, or of the wrong shape. The message
@@ -63,11 +69,17 @@ def read_tensors(
                 if name not in expected:
                     problems.append(f"{name}: unknown")
                     continue
-                shape = tuple(opened.get_slice(full_name).get_shape())
-                if shape != tuple(expected[name]):
-                    problems.append(f"{name}: shape {shape}, expected {tuple(expected[name])}")
+                stored = opened.get_slice(full_name)
+                shape, wanted = tuple(stored.get_shape()), tuple(expected[name])
+                is_int4 = stored.get_dtype() == "U8" and len(wanted) == 2
+                if is_int4:  # two weights of a row in a byte
+                    wanted = (wanted[0], (wanted[1] + 1) // 2)
+                if shape != wanted:
+                    problems.append(f"{name}: shape {shape}, expected {wanted}")
                     continue
                 tensor = opened.get_tensor(full_name)
+                if is_int4:
+                    tensor = int4_values(tensor)[:, : expected[name][1]]
                 if tensor.dtype == torch.int8:
                     integers.add(name)
                 tensors[name] = tensor.to(dtype)
@@ -77,7 +89,7 @@ def read_tensors(
             tensors[name] *= scale.to(dtype)[:, None]
         else:
             problems.append(
-                f"{name}: expected an int8 matrix with scales {name}{SCALE_SUFFIX} {rows}, or neither"
+                f"{name}: expected an int8 or int4 matrix with scales {name}{SCALE_SUFFIX} {rows}, or neither"
             )
     for name, shape in expected.items():
         if shape.numel() == 0:  # an empty table of future tokens need not be stored

@@ -22,7 +22,8 @@ class SaccadeConfig(PreTrainedConfig):
         checkpoint: The directory of a whole GR00T checkpoint, or its id in the local cache of
             ``huggingface_hub``. Required, except for a directory that ``save_pretrained`` wrote.
         embodiment: Tag or id of the robot. Required if the checkpoint has statistics of several robots.
-        precision: How the backbone computes, and the head: float32, bfloat16 or int8.
+        precision: How the backbone computes, and the head: float32, bfloat16, int8 or
+            int4.
         head_precision: How the head computes. Default: as the backbone.
         num_threads: Number of threads. Default: as :meth:`saccade.Policy.from_pretrained`.
         preprocessing: ``lerobot`` or ``isaac``: how frames and words are prepared. Default: as the

@@ -29,7 +29,7 @@ INT64 = np.dtype(np.int64)
 UINT8 = np.dtype(np.uint8)
 
 #: The precisions that weights are loaded in.
-PRECISIONS = ("float32", "bfloat16", "int8")
+PRECISIONS = ("float32", "bfloat16", "int8", "int4")
 
 #: No head has as many tokens. A larger range is refused, since it would be slow to write out.
 LARGEST_RANGE = 1 << 20

@@ -28,7 +28,7 @@ def show_config(mode: Literal["stdout", "dicts"] = "stdout") -> dict[str, Any] |
       ``available_isas``.
     - ``cpu``: the name of the processor, where the system reports one.
     - ``dot_products``: the dot products that it uses on this CPU: ``bf16`` for the precision bfloat16, and
-      ``vnni``, ``dotprod`` or ``i8mm`` for int8. Both precisions also work without them.
+      ``vnni``, ``dotprod`` or ``i8mm`` for int8 and int4. All precisions also work without them.
     - ``family``: the family of this CPU, and ``rates``: the family whose measured rates choose between its
       instructions. A family that was not measured gets what the newest one of its vendor gets.
     - ``tiles``: whether AMX can be used; if not, why.

@@ -72,7 +72,7 @@ class Loaded(Generic[EngineT, ConfigT]):
 
     @property
     def precision(self) -> str:
-        """How it computes: ``"float32"``, ``"bfloat16"`` or ``"int8"``."""
+        """How it computes: ``"float32"``, ``"bfloat16"``, ``"int8"`` or ``"int4"``."""
         return self._engine.precision
 
     @property

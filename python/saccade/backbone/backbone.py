@@ -63,7 +63,7 @@ class Backbone(Loaded[_saccade.Backbone, BackboneConfig]):
                 (``vision_config``, ``text_config``, ``eagle``, ``select_layer``, ``project_to_dim``). Sizes
                 that it does not contain are those of the published model. Default: the ``config.json`` in the
                 directory of the weights, if there is one.
-            precision: ``"float32"``, ``"bfloat16"`` or ``"int8"``, as for
+            precision: ``"float32"``, ``"bfloat16"``, ``"int8"`` or ``"int4"``, as for
                 :meth:`saccade.ActionHead.from_pretrained`. The table of embeddings is kept in bfloat16, or in
                 float32 if it is stored so and the precision is float32.
 

@@ -112,10 +112,11 @@ def read_tensors(source: Source, prefix: str = "") -> dict[str, Float32Array]:
 
     Returns:
         Arrays by name without the prefix, sorted by name. float16 and bfloat16 are widened, which is exact.
-        int8 weights are multiplied by their scales.
+        int8 and int4 weights are multiplied by their scales; int4 has two columns for each byte of a row.
 
     Raises:
         FileNotFoundError: ``source`` does not exist.
-        CheckpointError: A file is damaged, or a tensor is not F32, BF16, F16 or I8 with scales.
+        CheckpointError: A file is damaged, or a tensor is not F32, BF16, F16, or I8 or U8 with
+            scales.
     """
     return _saccade.read_tensors(os.fspath(resolve(source, files=WEIGHTS)), prefix)

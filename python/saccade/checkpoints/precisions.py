@@ -26,6 +26,7 @@ PRECISIONS: Mapping[str, Mapping[str, str]] = MappingProxyType(
         "bfloat16": {"backbone": "bfloat16", "head": "bfloat16"},
         "int8, head bfloat16": {"backbone": "int8", "head": "bfloat16"},
         "int8": {"backbone": "int8", "head": "int8"},
+        "int4": {"backbone": "int4", "head": "int4"},
     }
 )
 

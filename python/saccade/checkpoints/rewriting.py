@@ -40,7 +40,7 @@ class QuantizeReport(Written):
     """What :func:`quantize` wrote."""
 
     num_quantized: int
-    """Number of weights that were converted to int8."""
+    """Number of weights that were converted to int8 or int4."""
     num_copied: int
     """Number of tensors that were copied bit for bit."""
     head_bytes_before: int
@@ -112,26 +112,32 @@ def quantize(
     source: Source,
     out: str | os.PathLike[str],
     *,
+    to: str = "int8",
     config: Config = None,
     head_only: bool = False,
     keep_backbone: bool = False,
     force: bool = False,
     progress: Progress = None,
 ) -> QuantizeReport:
-    """Writes a copy of a checkpoint with int8 weights: a quarter of the size of float32, half of bfloat16.
+    """Writes a copy of a checkpoint with int8 or int4 weights: half of bfloat16, or a quarter.
 
-    The weights of the attention and feed-forward layers of all blocks become int8: those of the head, and
+    The weights of the attention and feed-forward layers of all blocks are quantised: those of the head, and
     those of a backbone that :class:`saccade.Backbone` loads. These are the weights that precision ``"int8"``
-    computes with in int8. Such a weight is stored as row-major int8 ``X.weight
-    (out_features, in_features)`` with values from -127 to 127, and float32 ``X.weight_scale
-    (out_features,)``. A row represents its integers times its scale, which is the largest magnitude of the
-    row / 127. The result does not depend on the instruction set. All other tensors are copied bit for bit,
-    and so are the other files of the directory: statistics, processors, tokenizers.
+    or ``"int4"`` computes with as integers. A row represents its integers times its scale, float32
+    ``X.weight_scale (out_features,)``. The result does not depend on the instruction set. All other tensors
+    are copied bit for bit, and so are the other files of the directory: statistics, processors, tokenizers.
+
+    - int8: row-major int8 ``X.weight (out_features, in_features)`` with values from -127 to 127. The scale is
+      the largest magnitude of the row / 127.
+    - int4: uint8 ``X.weight (out_features, in_features / 2)``, rounded up, with two values from -7 to 7 in a
+      byte: the first one in the low four bits, both in two's complement. If ``in_features`` is odd, the high
+      four bits of a row's last byte are zero. The scale is the largest magnitude of the row / 7 times 1,
+      11/12, ... or 5/12, whichever gives the least squared error.
 
     :meth:`saccade.ActionHead.from_pretrained`, :meth:`saccade.Backbone.from_pretrained` and
-    :meth:`saccade.Policy.from_pretrained` read the copy at every precision. At ``"int8"`` it gives the same
-    bits as the source at ``"int8"``. At the others, the weights are those that the integers represent. No
-    other program reads these weights.
+    :meth:`saccade.Policy.from_pretrained` read the copy at every precision. At the precision ``to`` it gives
+    the same bits as the source at that precision. At the others, the weights are those that the integers
+    represent. No other program reads these weights.
 
     One tensor at a time is in memory. The directory appears under its name when everything is written.
 
@@ -139,6 +145,7 @@ def quantize(
         source: A directory (``config.json`` and one or more ``.safetensors`` files) or one ``.safetensors``
             file. Other files are copied only from a directory.
         out: The directory to write. Parent directories are created.
+        to: ``"int8"`` or ``"int4"``.
         config: As for :meth:`saccade.ActionHead.from_pretrained`. It becomes the ``config.json`` of the copy.
         head_only: Whether to leave out tensors outside the head.
         keep_backbone: Whether to copy the tensors of a backbone bit for bit.
@@ -151,11 +158,12 @@ def quantize(
         FileNotFoundError: ``source`` or the config does not exist.
         CheckpointError: The source is damaged, does not fit the config, is quantised already, or contains NaN
             or infinity. Or ``out`` cannot be written.
-        InputError: ``out`` exists and ``force`` is not set, or it contains other files or the source.
+        InputError: ``to`` is another precision, ``out`` exists and ``force`` is not set, or it contains other
+            files or the source.
     """
     rewrite = _rewrite(source, out, config, force=force, progress=progress, head_only=head_only)
     rewrite["keep_backbone"] = keep_backbone
-    return QuantizeReport(**_frozen(_saccade.quantize(rewrite)))
+    return QuantizeReport(**_frozen(_saccade.quantize(rewrite, text("to", to))))
 
 
 def convert(
@@ -192,7 +200,7 @@ def convert(
             space on file systems that support holes.
         dtype: ``"float32"``, ``"bfloat16"`` or ``"float16"``, for all floating point tensors, those outside
             the head included. Default: unchanged. Values are rounded to the nearest, and the report contains
-            the largest differences. int8 weights and their scales are kept.
+            the largest differences. int8 and int4 weights and their scales are kept.
         max_shard_bytes: Largest size of a file in bytes. A tensor that is larger gets a file of its own.
             Default: one file if the source has one, else 5 GB.
         head_only: As in :func:`quantize`. Other programs need the tensors outside the head.
@@ -201,7 +209,7 @@ def convert(
         FileNotFoundError: ``source`` or the config does not exist.
         CheckpointError: The source is damaged, does not fit the config, or contains a finite value beyond the
             range of the dtype. Or ``out`` cannot be written. Or the adapter is of another kind (DoRA, biases,
-            another type of PEFT), a tensor of it does not fit the source, or the source is in int8.
+            another type of PEFT), a tensor of it does not fit the source, or the source is quantised.
         InputError: An option is out of range, ``out`` exists and ``force`` is not set, or ``out`` contains
             other files or the source.
     """

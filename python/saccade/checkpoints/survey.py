@@ -42,7 +42,8 @@ class Slice:
     embodiment: int | None
     values: Float32Array
     drawn: Draw | None
-    """The distribution at initialisation. None if it is not compared: int8, and what only training uses."""
+    """The distribution at initialisation. None if it is not compared: int8 and int4, and what only training
+    uses."""
 
 
 class Survey:
@@ -82,7 +83,7 @@ class Survey:
             name = full_name.removeprefix(self._prefix)
             part = self._parts.setdefault(part_of(name), Part())
             part.tensors += 1
-            part.parameters += math.prod(shape)
+            part.parameters += math.prod(shape) * (2 if dtype == "U8" else 1)  # int4: two in a byte
             part.nbytes += nbytes
             part.dtypes[dtype] = part.dtypes.get(dtype, 0) + 1
             judged = []
@@ -98,7 +99,7 @@ class Survey:
                 progress(done, total)
 
     def _slices(self, name: str, dtype: str, shape: tuple[int, ...]) -> Iterator[Slice]:
-        is_drawn = dtype != "I8" and part_of(name) != UNUSED and not name.endswith("_scale")
+        is_drawn = dtype not in ("I8", "U8") and part_of(name) != UNUSED and not name.endswith("_scale")
         drawn = draw(name, self._inputs(name, shape)) if is_drawn else None
         is_category = name.endswith((".W", ".b"))
         indices: list[int | None] = list(range(shape[0])) if is_category else [None]

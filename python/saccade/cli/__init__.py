@@ -41,7 +41,7 @@ COMMANDS: dict[str, str] = {
     "diagnose": "say which inputs a checkpoint uses",
     "convert": "write a checkpoint with other robots, dtype or files",
     "resize": "write a checkpoint with another number of future tokens",
-    "quantize": "write a checkpoint with int8 weights",
+    "quantize": "write a checkpoint with int8 or int4 weights",
 }
 # The commands of saccade-vla-lab, found by its entry points. They are listed here, so that the help and the
 # message that says what to install need no other package.

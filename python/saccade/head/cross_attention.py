@@ -69,7 +69,7 @@ class CrossAttention(Handle):
             ``to_out.0.weight (width, width)``, and ``to_q.bias``, ``to_k.bias``, ``to_v.bias``,
             ``to_out.0.bias (width,)``.
         num_heads: Number of attention heads, a divisor of the width.
-        precision: ``"float32"``, ``"bfloat16"`` or ``"int8"``, as in
+        precision: ``"float32"``, ``"bfloat16"``, ``"int8"`` or ``"int4"``, as in
             :meth:`saccade.ActionHead.from_pretrained`.
 
     Raises:
@@ -124,7 +124,7 @@ class CrossAttention(Handle):
 
     @property
     def precision(self) -> str:
-        """How it computes: ``"float32"``, ``"bfloat16"`` or ``"int8"``."""
+        """How it computes: ``"float32"``, ``"bfloat16"``, ``"int8"`` or ``"int4"``."""
         return self._attention.precision
 
     @property

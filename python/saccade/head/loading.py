@@ -48,7 +48,8 @@ class LoadedHead(Loaded[_saccade.ActionHead, HeadConfig]):
 
         The tensors of the head have the prefix ``action_head.``, ``_groot_model.action_head.`` or none.
         Tensors outside the prefix are ignored. Inside it every tensor must be known, present and of the right
-        shape. Tensors that ``saccade quantize`` stored as int8 can be loaded at every precision.
+        shape. Tensors that ``saccade quantize`` stored as int8 or int4 can be loaded at every
+        precision.
 
         Args:
             id_or_path: A directory (``config.json`` and one or more ``.safetensors`` files, with or without
@@ -79,6 +80,8 @@ class LoadedHead(Loaded[_saccade.ActionHead, HeadConfig]):
                 - ``"int8"``: the attention and feed-forward layers of all blocks multiply 8-bit integers,
                   with a scale for each output of the weights and one for each row of the inputs. A quarter of
                   the memory, and the fastest. Everything else is as in ``"bfloat16"``.
+                - ``"int4"``: as ``"int8"``, with weights of four bits. An eighth of the memory, and less
+                  accurate.
 
                 ``docs/precision.md`` has the measured accuracy of each.
             num_threads: Number of threads that a call uses. Default: the environment variable

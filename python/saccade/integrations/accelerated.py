@@ -18,7 +18,7 @@ from saccade.head.head import ActionHead
 from saccade.head.options import LoadOptions, precisions_of_parts
 from saccade.integrations import backbones, heads, modules
 from saccade.integrations.accelerated_backbone import AcceleratedBackbone
-from saccade.integrations.stand_in import EXACT_TOLERANCE, ROUNDED_TOLERANCE, Features, Kinds, StandIn
+from saccade.integrations.stand_in import Features, Kinds, StandIn, tolerance_of
 from saccade.integrations.weights import tensors_of
 
 #: Additional tolerance, relative to the noise, for rounding it at the start and after each of four steps. It
@@ -355,7 +355,7 @@ def agree(module: nn.Module, head: ActionHead, inputs: tuple[Features, Features]
     theirs = result["action_pred"]
     ours, _ = run(module, head, backbone_output, action_input, noise, {})
     expected, start = theirs.float().cpu(), noise.float().cpu()[..., : theirs.shape[-1]]
-    share = ROUNDED_TOLERANCE if rounded else EXACT_TOLERANCE
+    share = tolerance_of(head.precision, rounded)
     rounding = ROUNDED_ROUNDING if rounded else EXACT_ROUNDING
     norm = torch.linalg.vector_norm
     allowed = float(share * norm(expected - start) + rounding * norm(start))

@@ -14,7 +14,7 @@ from saccade.backbone.backbone import Backbone
 from saccade.errors import InputError
 from saccade.head.options import LoadOptions
 from saccade.integrations import backbones, modules
-from saccade.integrations.stand_in import EXACT_TOLERANCE, ROUNDED_TOLERANCE, Features, Kinds, StandIn
+from saccade.integrations.stand_in import Features, Kinds, StandIn, tolerance_of
 from saccade.integrations.weights import tensors_of
 
 
@@ -112,7 +112,7 @@ def agree(module: nn.Module, backbone: Backbone, device: torch.device, rounded: 
     if ours.shape == expected.shape:
         sizes = torch.linalg.vector_norm(expected, dim=-1).clamp_min(torch.finfo(torch.float32).tiny)
         error = float((torch.linalg.vector_norm(ours - expected, dim=-1) / sizes).mean())
-    allowed = ROUNDED_TOLERANCE if rounded else EXACT_TOLERANCE
+    allowed = tolerance_of(backbone.precision, rounded)
     if not error <= allowed:
         raise InputError(
             f"{type(module).__name__} cannot be accelerated: on a random view its features differ from those "

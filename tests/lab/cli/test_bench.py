@@ -16,7 +16,7 @@ from saccade.cli import main
 from saccade_lab.random_checkpoint.head import config_of_size, write_head
 from saccade_lab.timing import Call, Machine, by_turns, quartiles, works_of
 
-MACHINE = Machine("avx512", 1, {"float32": 1e9, "bfloat16": 2e9, "int8": 4e9}, 1e9)
+MACHINE = Machine("avx512", 1, {"float32": 1e9, "bfloat16": 2e9, "int8": 4e9, "int4": 4e9}, 1e9)
 
 
 @pytest.fixture(scope="module")
@@ -47,6 +47,7 @@ def test_peaks_of_this_machine() -> None:
         "float32": "portable-f32",
         "bfloat16": "portable-bf16-as-f32",
         "int8": "portable-int8",
+        "int4": "portable-int4",
     }
     assert list(peaks["read_bytes_per_second_by_streams"]) == [1, 16]
     assert peaks["read_bytes_per_second"] == max(peaks["read_bytes_per_second_by_streams"].values()) > 0
@@ -172,7 +173,7 @@ def test_the_shipped_policy_is_the_default(capsys: pytest.CaptureFixture[str]) -
     [
         (
             ["--precisions", "float16"],
-            "--precisions: unknown name 'float16', expected one of float32, bfloat16, int8",
+            "--precisions: unknown name 'float16', expected one of float32, bfloat16, int8, int4",
         ),
         (["--precisions", ""], "--precisions: expected at least one name"),
         (["--num-threads", "0"], "--num-threads: given 0, expected at least 1"),

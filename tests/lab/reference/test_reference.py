@@ -451,16 +451,22 @@ def test_load_lists_all_that_is_wrong(tmp_path: Path) -> None:
         ActionHead.from_pretrained(tmp_path / "nothing")
 
 
-def test_load_reads_int8_weights_as_what_they_stand_for(tmp_path: Path) -> None:
+@pytest.mark.parametrize("bits", [8, 4])
+def test_load_reads_quantised_weights_as_what_they_stand_for(bits: int, tmp_path: Path) -> None:
     config = small_config()
     tensors = {
         f"action_head.{name}": tensor.contiguous()
         for name, tensor in random_head(config, 0).state_dict().items()
     }
     name = "action_head.model.transformer_blocks.0.attn1.to_k.weight"
-    integers = torch.randint(-127, 128, tensors[name].shape, dtype=torch.int8)
+    most = 2 ** (bits - 1) - 1
+    integers = torch.randint(-most, most + 1, tensors[name].shape, dtype=torch.int8)
+    stored = integers
+    if bits == 4:  # two in a byte, the first one in its low half
+        low, high = (integers[:, first::2].to(torch.uint8) % 16 for first in (0, 1))
+        stored = low + 16 * torch.nn.functional.pad(high, (0, low.shape[1] - high.shape[1]))
     scales = torch.rand(len(integers))
-    quantised = {**tensors, name: integers, f"{name}_scale": scales}
+    quantised = {**tensors, name: stored, f"{name}_scale": scales}
 
     def load(tensors: dict[str, torch.Tensor]) -> ActionHead:
         save_file(tensors, tmp_path / "model.safetensors")
@@ -471,11 +477,13 @@ def test_load_reads_int8_weights_as_what_they_stand_for(tmp_path: Path) -> None:
     found = load(quantised).state_dict()
     assert all(torch.equal(found[key], value) for key, value in expected.items())
     for broken in (
-        {**tensors, name: integers},
+        {**tensors, name: stored},
         {**tensors, f"{name}_scale": scales},
         {**quantised, f"{name}_scale": scales[1:]},
     ):
-        with pytest.raises(CheckpointError, match=r"to_k\.weight: expected an int8 matrix with scales"):
+        with pytest.raises(
+            CheckpointError, match=r"to_k\.weight: expected an int8 or int4 matrix with scales"
+        ):
             load(broken)
 
 

@@ -183,7 +183,7 @@ def test_integrators_against_the_reference_in_float64(checkpoint: Path, integrat
     np.testing.assert_allclose(found, x, rtol=0, atol=2e-5)
 
 
-@pytest.mark.parametrize("precision", ["bfloat16", "int8"])
+@pytest.mark.parametrize("precision", ["bfloat16", "int8", "int4"])
 def test_a_mode_loads_its_precision(checkpoint: Path, precision: str) -> None:
     exact, lower = (
         saccade.ActionHead.from_pretrained(checkpoint, precision=one) for one in ("float32", precision)

@@ -13,9 +13,10 @@ use std::ops::Range;
 #[cfg(feature = "peak")]
 use super::elements::F32;
 use super::elements::{SumVector, Sums};
+use super::nibbles::Unpack;
 use super::prefetch::{Lines, Parts};
 use super::step::{MicroKernel, RunsOn, Step};
-use super::{Block, Shape};
+use super::{Block, MAX_NR, Shape};
 #[cfg(feature = "peak")]
 use crate::simd::MAX_LANES;
 use crate::simd::bits::cast;
@@ -33,6 +34,16 @@ unsafe impl<S: Simd, E: Step<Broadcast>> RunsOn<S, Broadcast> for E {}
 /// AVX-512 from 0.94 to 0.95 (with one step a turn).
 const BLOCK_STEPS: usize = 1024;
 
+/// Steps whose weights are unpacked together, an even number that parts are multiples of: 24 kB of bytes in the widest
+/// vectors, which the nearest cache holds until all tiles of the block have taken them.
+const UNPACKED_STEPS: usize = 128;
+
+const _: () = assert!(UNPACKED_STEPS.is_multiple_of(2) && (BLOCK_STEPS / 2).is_multiple_of(UNPACKED_STEPS));
+
+/// Where they are unpacked.
+#[repr(align(64))]
+struct Unpacked([MaybeUninit<u32>; UNPACKED_STEPS * MAX_NR]);
+
 // SAFETY: all rows of the block and all vectors of needed columns are written.
 unsafe impl MicroKernel for Broadcast {
     /// A panel as wide as the largest tile, rows one by one.
@@ -45,7 +56,12 @@ unsafe impl MicroKernel for Broadcast {
     }
 
     #[inline(always)]
-    unsafe fn multiply<S: Simd, E: Step<Self>>(simd: S, block: &Block<'_>, sums: &mut [MaybeUninit<u32>]) {
+    unsafe fn multiply<S: Simd, E: Step<Self>>(
+        simd: S,
+        block: &Block<'_>,
+        has_nibbles: bool,
+        sums: &mut [MaybeUninit<u32>],
+    ) {
         const { assert!(S::TILE_VECTORS <= 3) }
         // 128 outputs are 8 vectors of AVX-512, not the 9 of three whole panels: a head of width 128 took
         // 0.93 of the time on one thread of a Zen 4.
@@ -54,12 +70,12 @@ unsafe impl MicroKernel for Broadcast {
         // SAFETY: the contract of this function, and `sums` has room for the rows of the block.
         unsafe {
             match (S::TILE_VECTORS, used) {
-                (1, _) => panel_rows::<S, E, 1, 1>(simd, block, sums),
-                (2, 1) => panel_rows::<S, E, 2, 1>(simd, block, sums),
-                (2, _) => panel_rows::<S, E, 2, 2>(simd, block, sums),
-                (3, 1) => panel_rows::<S, E, 3, 1>(simd, block, sums),
-                (3, 2) => panel_rows::<S, E, 3, 2>(simd, block, sums),
-                (3, _) => panel_rows::<S, E, 3, 3>(simd, block, sums),
+                (1, _) => panel_rows::<S, E, 1, 1>(simd, block, has_nibbles, sums),
+                (2, 1) => panel_rows::<S, E, 2, 1>(simd, block, has_nibbles, sums),
+                (2, _) => panel_rows::<S, E, 2, 2>(simd, block, has_nibbles, sums),
+                (3, 1) => panel_rows::<S, E, 3, 1>(simd, block, has_nibbles, sums),
+                (3, 2) => panel_rows::<S, E, 3, 2>(simd, block, has_nibbles, sums),
+                (3, _) => panel_rows::<S, E, 3, 3>(simd, block, has_nibbles, sums),
                 (vectors, _) => unreachable!("a tile of {vectors} vectors"),
             }
         }
@@ -115,12 +131,17 @@ unsafe fn peak<S: Simd, E: Step<Broadcast>, const NV: usize, const MR: usize>(si
 unsafe fn panel_rows<S: Simd, E: Step<Broadcast>, const NV: usize, const UV: usize>(
     simd: S,
     block: &Block<'_>,
+    has_nibbles: bool,
     sums: *mut u32,
 ) {
     const { assert!(1 <= UV && UV <= NV) }
     let first_row = block.rows().start;
     let steps = block.in_features.div_ceil(E::DEPTH);
+    let has_nibbles = E::ARE_BYTES && has_nibbles;
+    // Words that a step multiplies, and those of the panel that they are unpacked from.
     let step_words = NV * S::LANES;
+    let halves = if has_nibbles { 2 } else { 1 };
+    let panel_step = step_words / halves;
     // Streams must not change where sums are cut; integers are not cut.
     const {
         let part = E::Sums::PART / E::DEPTH;
@@ -129,47 +150,67 @@ unsafe fn panel_rows<S: Simd, E: Step<Broadcast>, const NV: usize, const UV: usi
     // As streams, a part is prefetched while the one before it is multiplied. One of 1024 steps after one of
     // 512 would take twice the pace: parts of 512 made 1536 steps 1.04 to 1.08 times as fast (AVX-512,
     // float32, Intel with AMX), and no difference where 1024 divides them. Families of AMD prefetch in order.
-    let is_uneven = steps > BLOCK_STEPS && !steps.is_multiple_of(BLOCK_STEPS);
-    let part_steps = if is_uneven && block.prefetches_streams(step_words) {
-        BLOCK_STEPS / 2
+    let block_steps = BLOCK_STEPS * halves;
+    let is_uneven = steps > block_steps && !steps.is_multiple_of(block_steps);
+    let part_steps = if is_uneven && block.prefetches_streams(panel_step) {
+        block_steps / 2
     } else {
-        BLOCK_STEPS
+        block_steps
     };
-    let parts = Parts::new(block, step_words, steps, part_steps);
-    for part in parts.iter() {
+    let parts = Parts::new(block, panel_step, steps, part_steps);
+    let mut unpacked = Unpacked([const { MaybeUninit::uninit() }; UNPACKED_STEPS * MAX_NR]);
+    let together = if has_nibbles { UNPACKED_STEPS } else { part_steps };
+    // One that is empty as well: its sums are zero.
+    for index in 0..steps.div_ceil(together).max(1) {
+        let range = index * together..steps.min((index + 1) * together);
+        let part = parts.part_of(range.start);
+        let weights = if has_nibbles {
+            // Two steps are one of the panel, the last one perhaps with the second empty.
+            let panel = &block.weights[range.start / 2 * step_words..range.end.div_ceil(2) * step_words];
+            simd.run(&mut Unpack {
+                panel,
+                row: step_words,
+                to: &mut unpacked.0,
+            });
+            unpacked.0.as_ptr().cast()
+        } else {
+            block.weights[range.start * step_words..range.end * step_words].as_ptr()
+        };
         for call in block.calls.clone() {
             let Range { start: row, end } = block.split.rows(&(call..call + 1));
-            // SAFETY: the rows are in the block, their sums within the block's, and the part within the
-            // panel.
+            // SAFETY: the rows are in the block, their sums within the block's, and the weights are those of
+            // the range.
             unsafe {
                 let tile = Tile {
                     row,
+                    weights,
                     sums: sums.add((row - first_row) * NV * S::LANES),
                     ahead: parts.lines(&part, call - block.calls.start),
+                    ahead_from: part.start,
                     is_one_of_few: block.calls.len() < NV,
                 };
                 match end - row {
-                    1 => tile_part::<S, E, NV, UV, 1>(simd, block, &part, &tile),
+                    1 => tile_part::<S, E, NV, UV, 1>(simd, block, &range, &tile),
                     2 if const { mr::<S, E>() >= 2 } => {
-                        tile_part::<S, E, NV, UV, 2>(simd, block, &part, &tile)
+                        tile_part::<S, E, NV, UV, 2>(simd, block, &range, &tile)
                     }
                     3 if const { mr::<S, E>() >= 3 } => {
-                        tile_part::<S, E, NV, UV, 3>(simd, block, &part, &tile)
+                        tile_part::<S, E, NV, UV, 3>(simd, block, &range, &tile)
                     }
                     4 if const { mr::<S, E>() >= 4 } => {
-                        tile_part::<S, E, NV, UV, 4>(simd, block, &part, &tile)
+                        tile_part::<S, E, NV, UV, 4>(simd, block, &range, &tile)
                     }
                     5 if const { mr::<S, E>() >= 5 } => {
-                        tile_part::<S, E, NV, UV, 5>(simd, block, &part, &tile)
+                        tile_part::<S, E, NV, UV, 5>(simd, block, &range, &tile)
                     }
                     6 if const { mr::<S, E>() >= 6 } => {
-                        tile_part::<S, E, NV, UV, 6>(simd, block, &part, &tile)
+                        tile_part::<S, E, NV, UV, 6>(simd, block, &range, &tile)
                     }
                     7 if const { mr::<S, E>() >= 7 } => {
-                        tile_part::<S, E, NV, UV, 7>(simd, block, &part, &tile)
+                        tile_part::<S, E, NV, UV, 7>(simd, block, &range, &tile)
                     }
                     8 if const { mr::<S, E>() >= 8 } => {
-                        tile_part::<S, E, NV, UV, 8>(simd, block, &part, &tile)
+                        tile_part::<S, E, NV, UV, 8>(simd, block, &range, &tile)
                     }
                     rows => unreachable!("a tile of {rows} rows"),
                 }
@@ -183,11 +224,14 @@ const fn mr<S: Simd, E: Step<Broadcast>>() -> usize {
     S::TILE_ROWS - E::FEWER_GROUPS
 }
 
-/// A tile of sums: its first row, where its sums go, and what it prefetches.
+/// A tile of sums: its first row, the weights that it meets, where its sums go, and what it prefetches from step
+/// `ahead_from` on.
 struct Tile {
     row: usize,
+    weights: *const u32,
     sums: *mut u32,
     ahead: Lines,
+    ahead_from: usize,
     /// Of fewer tiles than a step has cache lines: each prefetches several.
     is_one_of_few: bool,
 }
@@ -195,7 +239,7 @@ struct Tile {
 /// `MR` rows by `UV` vectors of `NV` over one part of `k`.
 ///
 /// # Safety
-/// As [`panel_rows`]; the block has rows `tile.row .. tile.row + MR`, the panel the steps in `part`, and
+/// As [`panel_rows`]; the block has rows `tile.row .. tile.row + MR`, `tile.weights` the steps in `part`, and
 /// `tile.sums` room for the rows.
 #[inline(always)]
 unsafe fn tile_part<S: Simd, E: Step<Broadcast>, const NV: usize, const UV: usize, const MR: usize>(
@@ -233,7 +277,7 @@ unsafe fn tile_part<S: Simd, E: Step<Broadcast>, const NV: usize, const UV: usiz
             }
         }
     }
-    let weights = block.weights.as_ptr();
+    let weights = tile.weights;
     let mut first = part.start;
     loop {
         let end = part.end.min(first + E::Sums::PART / E::DEPTH);
@@ -250,7 +294,7 @@ unsafe fn tile_part<S: Simd, E: Step<Broadcast>, const NV: usize, const UV: usiz
                 // Memory works while the sums are made. Measured at 49 x 1536 x 6144 on Zen 4, in order,
                 // share of the FMA peak without and with it, with one step a turn: 0.89 and 0.95 (AVX-512),
                 // 0.69 and 0.85 (AVX2).
-                let (mut next, steps) = tile.ahead.at(step - part.start);
+                let (mut next, steps) = tile.ahead.at(step - tile.ahead_from);
                 // Hidden: compilers find the smaller of the two again in each step.
                 let round = step..black_box(whole.min(step + steps));
                 step = round.end;
@@ -260,12 +304,12 @@ unsafe fn tile_part<S: Simd, E: Step<Broadcast>, const NV: usize, const UV: usiz
                             simd.prefetch(next.wrapping_add(line * LINE).cast());
                         }
                         next = next.wrapping_add(tile.ahead.pitch);
-                        let words = weights.add(step * row_elements);
+                        let words = weights.add((step - part.start) * row_elements);
                         E::multiply_add(simd, &mut sums, &x, step, words, E::DEPTH);
                     }
                 } else {
                     let Range { mut start, end } = round;
-                    let mut words = weights.add(start * row_elements);
+                    let mut words = weights.add((start - part.start) * row_elements);
                     while start + unrolled <= end {
                         for index in 0..unrolled {
                             simd.prefetch(next.cast());
@@ -279,14 +323,14 @@ unsafe fn tile_part<S: Simd, E: Step<Broadcast>, const NV: usize, const UV: usiz
                     for step in start..end {
                         simd.prefetch(next.cast());
                         next = next.wrapping_add(tile.ahead.pitch);
-                        let words = weights.add(step * row_elements);
+                        let words = weights.add((step - part.start) * row_elements);
                         E::multiply_add(simd, &mut sums, &x, step, words, E::DEPTH);
                     }
                 }
             }
             if whole < end {
                 let rest = block.in_features - whole * E::DEPTH;
-                let words = weights.add(whole * row_elements);
+                let words = weights.add((whole - part.start) * row_elements);
                 E::multiply_add(simd, &mut sums, &x, whole, words, rest);
             }
             // Parts after the first read what the one before has written.

@@ -23,7 +23,10 @@ pub(crate) trait Elements: Send + Sync + Sized + 'static {
         Element::F32 => 1,
         Element::Bf16 => 2,
         Element::Int8 => 4,
+        Element::Int4 => panic!("int8, in panels of nibbles"),
     };
+    /// Whether panels may hold nibbles, which are unpacked to bytes.
+    const ARE_BYTES: bool = matches!(Self::WEIGHTS, Element::Int8);
 
     /// Whether bfloat16 weights are widened to be multiplied in float32.
     #[cfg(any(feature = "peak", all(target_arch = "aarch64", not(saccade_portable))))]

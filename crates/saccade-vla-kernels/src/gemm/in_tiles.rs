@@ -8,6 +8,7 @@ use std::ops::Range;
 use super::convert::Convert;
 use super::elements::{Elements, RowElements};
 use super::name::{Joined, join};
+use super::nibbles::{NAME_INT4, Unpack, has_nibbles};
 use super::outliers::MultiplyOutliers;
 use super::prefetch::Parts;
 use super::{
@@ -24,7 +25,7 @@ const COLUMNS: usize = 3 * TILE;
 
 const _: () = assert!(COLUMNS <= MAX_NR && MAX_ROWS <= MAX_MR);
 
-/// Words of a panel that one step meets.
+/// Words of weights that one step multiplies.
 const STEP_WORDS: usize = TILE * COLUMNS;
 
 /// Steps of a part of a panel at most: 192 kB, and in as many steps a line of each of 48 streams of 4 kB.
@@ -39,21 +40,34 @@ const ROW_BYTES: usize = 5 << 18;
 /// word][column]`, in whole steps of 16 words.
 pub(crate) struct InTiles<U, E> {
     unit: U,
+    /// Whether panels are of int4.
+    has_nibbles: bool,
     elements: PhantomData<E>,
 }
 
 impl<U: TileUnit, E: Elements> InTiles<U, E> {
     const JOINED: Joined = join(U::NAME, "", E::NAME);
     const NAME: &'static str = Joined::as_str(&Self::JOINED);
+    const JOINED_INT4: Joined = join(U::NAME, "", NAME_INT4);
+    const NAME_INT4: &'static str = Joined::as_str(&Self::JOINED_INT4);
     const OPERATION: Operation = match E::WEIGHTS {
         Element::Bf16 => Operation::Bf16,
         Element::Int8 => Operation::Int8,
-        Element::F32 => panic!("no tiles multiply float32"),
+        Element::F32 | Element::Int4 => panic!("no tiles multiply them"),
     };
 
     /// Steps over which is summed.
     fn steps(in_features: usize) -> usize {
         in_features.div_ceil(TILE * E::PER_WORD)
+    }
+
+    /// Words of a panel for a step.
+    fn panel_step(&self) -> usize {
+        if self.has_nibbles {
+            STEP_WORDS / 2
+        } else {
+            STEP_WORDS
+        }
     }
 
     /// Prefetches where the results of some rows go: by the time that their sums are made, they are here.
@@ -70,13 +84,21 @@ impl<U: TileUnit, E: Elements> InTiles<U, E> {
 // SAFETY: all steps write or add to the sums of all rows and columns, the first of them writes; the sizes are
 // constant.
 unsafe impl<U: TileUnit, E: Elements> Gemm for InTiles<U, E> {
-    fn new() -> Option<Self> {
-        let elements = PhantomData;
-        U::new().map(|unit| Self { unit, elements })
+    fn new(weights: Element) -> Option<Self> {
+        let has_nibbles = has_nibbles::<E>(weights);
+        U::new().map(|unit| Self {
+            unit,
+            has_nibbles,
+            elements: PhantomData,
+        })
     }
 
     fn name(&self) -> &'static str {
-        Self::NAME
+        if self.has_nibbles {
+            Self::NAME_INT4
+        } else {
+            Self::NAME
+        }
     }
 
     fn shape(&self) -> Shape {
@@ -93,11 +115,11 @@ unsafe impl<U: TileUnit, E: Elements> Gemm for InTiles<U, E> {
     }
 
     fn panel_words(&self, in_features: usize) -> usize {
-        STEP_WORDS * Self::steps(in_features)
+        self.panel_step() * Self::steps(in_features)
     }
 
     fn pack(&self, weight: WeightRef<'_>, first: usize, panel: PanelMut<'_>) {
-        pack::pack::<E>(weight, first, COLUMNS, panel);
+        pack::pack::<E>(weight, first, COLUMNS, self.has_nibbles, panel);
     }
 
     fn converted_stride(&self, in_features: usize) -> Option<usize> {
@@ -123,19 +145,71 @@ unsafe impl<U: TileUnit, E: Elements> Gemm for InTiles<U, E> {
 
     fn multiply_and_finish(&self, block: &Block<'_>, sums: &mut [MaybeUninit<u32>], finish: Finish<'_>) {
         let steps = Self::steps(block.in_features);
-        block.check(self.shape(), STEP_WORDS * steps, TILE * steps, sums);
-        let first_row = block.rows().start;
+        block.check(self.shape(), self.panel_step() * steps, TILE * steps, sums);
         if steps == 0 {
             sums[..block.rows().len() * COLUMNS].fill(MaybeUninit::new(0));
             return finish(block.rows(), sums);
         }
+        if self.has_nibbles {
+            self.multiply_unpacked(block, steps, sums, finish);
+        } else {
+            self.multiply_parts(block, steps, None, sums, finish);
+        }
+    }
+
+    fn multiply_outliers(&self, mut outliers: MultiplyOutliers<'_>) {
+        outliers.has_nibbles = self.has_nibbles;
+        self.unit.simd().run(&mut outliers);
+    }
+}
+
+/// The weights of a part, in the second-level cache, from which a call takes them as it takes those that are not
+/// unpacked.
+#[repr(align(64))]
+struct Unpacked([MaybeUninit<u32>; STEP_WORDS * PART_STEPS]);
+
+impl<U: TileUnit, E: Elements> InTiles<U, E> {
+    /// Multiplies panels of nibbles. Apart, because the stack is touched wherever a function has so much of it.
+    #[inline(never)]
+    fn multiply_unpacked(
+        &self,
+        block: &Block<'_>,
+        steps: usize,
+        sums: &mut [MaybeUninit<u32>],
+        finish: Finish<'_>,
+    ) {
+        let mut unpacked = Unpacked([const { MaybeUninit::uninit() }; STEP_WORDS * PART_STEPS]);
+        self.multiply_parts(block, steps, Some(&mut unpacked), sums, finish);
+    }
+
+    /// The sums of `steps`, of weights that are unpacked if there is room for them.
+    #[inline(never)]
+    fn multiply_parts(
+        &self,
+        block: &Block<'_>,
+        steps: usize,
+        mut unpacked: Option<&mut Unpacked>,
+        sums: &mut [MaybeUninit<u32>],
+        finish: Finish<'_>,
+    ) {
+        let first_row = block.rows().start;
+        let panel_step = self.panel_step();
         // Sums stay in their tiles over a part: on their way to memory and back they cost more than weights
         // that are read again from the second-level cache.
         let part_steps = steps.div_ceil(steps.div_ceil(PART_STEPS)).next_multiple_of(8);
-        let parts = Parts::new(block, STEP_WORDS, steps, part_steps);
+        let parts = Parts::new(block, panel_step, steps, part_steps);
         // SAFETY: no other session is open, and finishing uses no tiles.
         let mut session = unsafe { Session::new(self.unit) };
         for part in parts.iter() {
+            let panel = &block.weights[panel_step * part.start..panel_step * part.end];
+            let weights = match &mut unpacked {
+                Some(Unpacked(to)) => {
+                    let row = COLUMNS;
+                    self.unit.simd().run(&mut Unpack { panel, row, to });
+                    to.as_ptr().cast()
+                }
+                None => panel.as_ptr(),
+            };
             for call in block.calls.clone() {
                 let rows = block.split.rows(&(call..call + 1));
                 let is_last = part.end == steps;
@@ -148,7 +222,7 @@ unsafe impl<U: TileUnit, E: Elements> Gemm for InTiles<U, E> {
                     rows: rows.len(),
                     x: x.wrapping_add(rows.start * block.x.row_stride() + part.start * TILE),
                     x_stride: block.x.row_stride(),
-                    w: block.weights[part.start * STEP_WORDS..].as_ptr(),
+                    w: weights,
                     w_stride: COLUMNS,
                     w_column: TILE,
                     w_step: STEP_WORDS,
@@ -169,10 +243,6 @@ unsafe impl<U: TileUnit, E: Elements> Gemm for InTiles<U, E> {
                 }
             }
         }
-    }
-
-    fn multiply_outliers(&self, mut outliers: MultiplyOutliers<'_>) {
-        self.unit.simd().run(&mut outliers);
     }
 }
 

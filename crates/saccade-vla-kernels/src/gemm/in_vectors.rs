@@ -5,6 +5,7 @@ use std::mem::MaybeUninit;
 
 use super::convert::Convert;
 use super::name::{Joined, join};
+use super::nibbles::{NAME_INT4, has_nibbles, packed_words};
 use super::outliers::MultiplyOutliers;
 use super::step::{MicroKernel, RunsOn, Step};
 use super::{Block, Conversion, Gemm, PanelMut, Shape, pack};
@@ -14,6 +15,8 @@ use crate::weights::{Element, WeightRef};
 /// Products of `E` in the vectors of `S` by the micro-kernel `L`.
 pub(crate) struct InVectors<S, E, L = super::broadcast::Broadcast> {
     simd: S,
+    /// Whether panels are of int4.
+    has_nibbles: bool,
     kinds: PhantomData<(E, L)>,
 }
 
@@ -23,21 +26,27 @@ impl<S: Simd, E: Step<L>, L: MicroKernel> InVectors<S, E, L> {
         _ => join(S::NAME, "", E::NAME),
     };
     const NAME: &'static str = Joined::as_str(&Self::JOINED);
-
-    fn panel_words_of(in_features: usize) -> usize {
-        L::shape::<S, E>().nr * (E::DEPTH / E::PER_WORD) * in_features.div_ceil(E::DEPTH)
-    }
+    const JOINED_INT4: Joined = join(S::NAME, S::DOT_NAME, NAME_INT4);
+    const NAME_INT4: &'static str = Joined::as_str(&Self::JOINED_INT4);
 }
 
 // SAFETY: the micro-kernel writes the sums, and its shape is constant.
 unsafe impl<S: Simd, E: RunsOn<S, L>, L: MicroKernel> Gemm for InVectors<S, E, L> {
-    fn new() -> Option<Self> {
-        let kinds = PhantomData;
-        S::new().map(|simd| Self { simd, kinds })
+    fn new(weights: Element) -> Option<Self> {
+        let has_nibbles = has_nibbles::<E>(weights);
+        S::new().map(|simd| Self {
+            simd,
+            has_nibbles,
+            kinds: PhantomData,
+        })
     }
 
     fn name(&self) -> &'static str {
-        Self::NAME
+        if self.has_nibbles {
+            Self::NAME_INT4
+        } else {
+            Self::NAME
+        }
     }
 
     fn shape(&self) -> Shape {
@@ -45,11 +54,17 @@ unsafe impl<S: Simd, E: RunsOn<S, L>, L: MicroKernel> Gemm for InVectors<S, E, L
     }
 
     fn panel_words(&self, in_features: usize) -> usize {
-        Self::panel_words_of(in_features)
+        let words = E::DEPTH / E::PER_WORD * in_features.div_ceil(E::DEPTH);
+        let packed = if self.has_nibbles {
+            packed_words(words, E::GROUP)
+        } else {
+            words
+        };
+        self.shape().nr * packed
     }
 
     fn pack(&self, weight: WeightRef<'_>, first: usize, panel: PanelMut<'_>) {
-        pack::pack::<E>(weight, first, self.shape().nr, panel);
+        pack::pack::<E>(weight, first, self.shape().nr, self.has_nibbles, panel);
     }
 
     fn converted_stride(&self, in_features: usize) -> Option<usize> {
@@ -64,18 +79,24 @@ unsafe impl<S: Simd, E: RunsOn<S, L>, L: MicroKernel> Gemm for InVectors<S, E, L
         let row_words = E::converted_stride(block.in_features).unwrap_or(block.in_features);
         block.check(self.shape(), self.panel_words(block.in_features), row_words, sums);
         // SAFETY: checked above, and `S` has the instructions because of `RunsOn`.
-        self.simd.run(&mut unsafe { Multiply::<E, L>::new(block, sums) });
+        self.simd
+            .run(&mut unsafe { Multiply::<E, L>::new(block, self.has_nibbles, sums) });
     }
 
     fn multiply_outliers(&self, outliers: MultiplyOutliers<'_>) {
-        let run = E::GROUP;
-        self.simd.run(&mut MultiplyOutliers { run, ..outliers });
+        let (run, has_nibbles) = (E::GROUP, self.has_nibbles);
+        self.simd.run(&mut MultiplyOutliers {
+            run,
+            has_nibbles,
+            ..outliers
+        });
     }
 }
 
 /// The sums of a block.
 struct Multiply<'a, 'b, E, L> {
     block: &'a Block<'b>,
+    has_nibbles: bool,
     sums: &'a mut [MaybeUninit<u32>],
     kinds: PhantomData<(E, L)>,
 }
@@ -83,9 +104,13 @@ struct Multiply<'a, 'b, E, L> {
 impl<'a, 'b, E, L> Multiply<'a, 'b, E, L> {
     /// # Safety
     /// As [`MicroKernel::multiply`], of the instruction set that this runs on.
-    unsafe fn new(block: &'a Block<'b>, sums: &'a mut [MaybeUninit<u32>]) -> Self {
-        let kinds = PhantomData;
-        Self { block, sums, kinds }
+    unsafe fn new(block: &'a Block<'b>, has_nibbles: bool, sums: &'a mut [MaybeUninit<u32>]) -> Self {
+        Self {
+            block,
+            has_nibbles,
+            sums,
+            kinds: PhantomData,
+        }
     }
 }
 
@@ -95,7 +120,7 @@ impl<E: Step<L>, L: MicroKernel> Kernel for Multiply<'_, '_, E, L> {
     #[inline(always)]
     fn run<S: Simd>(&mut self, simd: S) {
         // SAFETY: the constructor's contract.
-        unsafe { L::multiply::<S, E>(simd, self.block, self.sums) }
+        unsafe { L::multiply::<S, E>(simd, self.block, self.has_nibbles, self.sums) }
     }
 }
 

@@ -21,6 +21,7 @@ pub(crate) mod in_vectors;
 mod name;
 #[cfg(all(target_arch = "aarch64", not(saccade_portable)))]
 pub(crate) mod neon;
+mod nibbles;
 pub(crate) mod outliers;
 mod pack;
 #[cfg_attr(
@@ -40,7 +41,7 @@ use crate::aligned::Zeroable;
 use crate::parts::part_start;
 use crate::rows::{Rows, RowsMut};
 use crate::simd::LINE;
-use crate::weights::WeightRef;
+use crate::weights::{Element, WeightRef};
 use outliers::{MultiplyOutliers, Outliers};
 
 /// Sizes that rows and weights are split by.
@@ -89,9 +90,9 @@ unsafe impl Zeroable for Quantized {}
 pub(crate) struct PanelMut<'a> {
     /// [`Gemm::panel_words`] of them.
     pub words: &'a mut [u32],
-    /// The scale of each column, of int8; otherwise empty.
+    /// What each column's sums are multiplied by, of int8 and int4; otherwise empty.
     pub scales: &'a mut [f32],
-    /// The sum of each column's int8 weights, likewise.
+    /// The sum of each column's bytes, likewise.
     pub sums: &'a mut [i32],
 }
 
@@ -101,7 +102,7 @@ pub(crate) struct Conversion<'a> {
     pub x: Rows<'a>,
     /// A group in each row, [`Gemm::converted_stride`] words for each of its rows.
     pub words: RowsMut<'a, u32>,
-    /// How each row was quantised, of int8.
+    /// How each row was quantised, of int8 and int4.
     pub quantized: Option<RowsMut<'a, Quantized>>,
     /// The outliers of each row, if they are to be kept apart.
     pub outliers: Option<RowsMut<'a, Outliers>>,
@@ -200,7 +201,7 @@ impl Block<'_> {
 /// rows and panels, and makes results of the sums.
 ///
 /// An implementation sums each element in an order that depends on nothing but `in_features`: neither on the
-/// number of rows nor on where a row is. The sums are float32, and of int8 they are int32, of which
+/// number of rows nor on where a row is. The sums are float32, and of int8 and int4 they are int32, of which
 /// `scales[column] * quantized[row].scale * (sum - quantized[row].zero * sums[column])` is the product.
 ///
 /// # Safety
@@ -208,8 +209,8 @@ impl Block<'_> {
 /// [`Self::shape`] never changes, and `nr`, `mr` and [`Self::row_block`] are at most [`MAX_NR`], [`MAX_MR`]
 /// and [`MAX_ROW_BLOCK`].
 pub(crate) unsafe trait Gemm: PeakLoop + Send + Sync {
-    /// The kernel, if this CPU has the instructions.
-    fn new() -> Option<Self>
+    /// The kernel for panels of these elements, if this CPU has the instructions. One of int8 takes int4, too.
+    fn new(weights: Element) -> Option<Self>
     where
         Self: Sized;
 
@@ -246,7 +247,7 @@ pub(crate) unsafe trait Gemm: PeakLoop + Send + Sync {
         finish(block.rows(), sums);
     }
 
-    /// Multiplies what was kept apart of rows by a panel of int8.
+    /// Multiplies what was kept apart of rows by a panel of int8 or int4.
     fn multiply_outliers(&self, outliers: MultiplyOutliers<'_>);
 }
 
@@ -269,8 +270,8 @@ pub(crate) trait PeakLoop {}
 impl<T> PeakLoop for T {}
 
 /// A product, where this CPU has the instructions.
-pub(crate) fn available<G: Gemm + 'static>() -> Option<Box<dyn Gemm>> {
-    Some(Box::new(G::new()?))
+pub(crate) fn available<G: Gemm + 'static>(weights: Element) -> Option<Box<dyn Gemm>> {
+    Some(Box::new(G::new(weights)?))
 }
 
 /// Words of a converted row with `per_word` elements in a word: whole cache lines, an odd number of them.

@@ -90,14 +90,15 @@ fn ninth(row: &[f32], limit: f32) -> f32 {
     largest[MAX_OUTLIERS]
 }
 
-/// Multiplies the outliers of rows by a panel of quads of int8.
+/// Multiplies the outliers of rows by a panel of bytes or of nibbles.
 pub(crate) struct MultiplyOutliers<'a> {
     /// Of each row.
     pub outliers: &'a [Outliers],
     pub panel: &'a [u32],
     pub columns: usize,
-    /// Words of a column next to each other in the panel.
+    /// Words of a column next to each other in the panel, and whether a word is two words of int8.
     pub run: usize,
+    pub has_nibbles: bool,
     /// Rows of `columns` sums, zero at first.
     pub sums: &'a mut [f32],
 }
@@ -111,24 +112,28 @@ impl Kernel for MultiplyOutliers<'_> {
         for (outliers, sums) in rows.filter(|(outliers, _)| !outliers.is_empty()) {
             for (input, value) in outliers.iter() {
                 let (run, word) = (self.run, input / 4);
-                let words = &self.panel[word / run * run * self.columns..][..run * self.columns];
-                let shift = 24 - 8 * (input % 4) as u32;
+                let (halves, mask) = if self.has_nibbles { (2, !15) } else { (1, !0) };
+                let words = &self.panel[word / run / halves * run * self.columns..][..run * self.columns];
+                // Of nibbles, words alternate: the low half of each byte, then the high one.
+                let is_low_half = self.has_nibbles && (word / run).is_multiple_of(2);
+                let shift = 24 - 8 * (input % 4) as u32 + if is_low_half { 4 } else { 0 };
                 if run == 1 {
                     // Words next to each other: compilers make vectors of them.
-                    add(sums, words.iter(), shift, value);
+                    add(sums, words.iter(), shift, mask, value);
                 } else {
-                    add(sums, words[word % run..].iter().step_by(run), shift, value);
+                    add(sums, words[word % run..].iter().step_by(run), shift, mask, value);
                 }
             }
         }
     }
 }
 
-/// `sums += value * weight` for the weights that are the byte of these words that ends `shift` bits below the top.
+/// `sums += value * weight` for the weights that are the bits in `mask` of the byte of these words that ends `shift` bits below
+/// the top.
 #[inline(always)]
-fn add<'a>(sums: &mut [f32], words: impl Iterator<Item = &'a u32>, shift: u32, value: f32) {
+fn add<'a>(sums: &mut [f32], words: impl Iterator<Item = &'a u32>, shift: u32, mask: i32, value: f32) {
     for (sum, word) in sums.iter_mut().zip(words) {
-        let weight = (word << shift).cast_signed() >> 24;
+        let weight = (word << shift).cast_signed() >> 24 & mask;
         *sum += value * weight as f32;
     }
 }

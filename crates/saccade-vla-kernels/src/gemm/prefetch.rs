@@ -55,9 +55,16 @@ impl<'a> Parts<'a> {
 
     /// The steps of each, in order.
     #[inline(always)]
-    pub(super) fn iter(&self) -> impl Iterator<Item = Range<usize>> + use<> {
-        let (steps, part) = (self.steps, self.part_steps);
-        (0..steps.div_ceil(part).max(1)).map(move |index| index * part..steps.min((index + 1) * part))
+    pub(super) fn iter(&self) -> impl Iterator<Item = Range<usize>> {
+        let count = self.steps.div_ceil(self.part_steps).max(1);
+        (0..count).map(|index| self.part_of(index * self.part_steps))
+    }
+
+    /// The steps of the part that has step number `step`.
+    #[inline(always)]
+    pub(super) fn part_of(&self, step: usize) -> Range<usize> {
+        let start = step / self.part_steps * self.part_steps;
+        start..self.steps.min(start + self.part_steps)
     }
 
     /// The weights that this thread takes after `part`: where they begin, and how many words they are.

@@ -39,12 +39,17 @@ pub(crate) trait Step<L>: Elements {
 pub(crate) unsafe trait MicroKernel: Sized + Send + Sync + 'static {
     fn shape<S: Simd, E: Step<Self>>() -> Shape;
 
-    /// What [`Gemm::multiply`] does.
+    /// What [`Gemm::multiply`] does, of int8 by panels that may have nibbles.
     ///
     /// # Safety
     /// [`Block::check`] was called with the sizes of this micro-kernel and these elements; `S` has the
     /// instructions that the elements need.
-    unsafe fn multiply<S: Simd, E: Step<Self>>(simd: S, block: &Block<'_>, sums: &mut [MaybeUninit<u32>]);
+    unsafe fn multiply<S: Simd, E: Step<Self>>(
+        simd: S,
+        block: &Block<'_>,
+        has_nibbles: bool,
+        sums: &mut [MaybeUninit<u32>],
+    );
 
     /// Steps of the largest tile for some milliseconds, as [`PeakLoop`](super::PeakLoop) has it.
     ///

@@ -39,14 +39,14 @@ pub(super) struct Finish<'a> {
     /// Of each column of the panel.
     pub bias: &'a [f32],
     /// How int32 sums become float32; None for sums that are float32 already.
-    pub int8: Option<Int8<'a>>,
+    pub quantized: Option<Dequantization<'a>>,
     /// The columns of the panel that the layer has.
     pub out: RowsMut<'a>,
 }
 
 /// Dequantisation: the scale of each column's weights and the sum of them, and how each row was quantised.
 #[derive(Clone, Copy)]
-pub(super) struct Int8<'a> {
+pub(super) struct Dequantization<'a> {
     pub scales: &'a [f32],
     pub weight_sums: &'a [i32],
     pub quantized: &'a [Quantized],
@@ -56,7 +56,7 @@ pub(super) struct Int8<'a> {
     pub apart: Rows<'a>,
 }
 
-impl<'a> Int8<'a> {
+impl<'a> Dequantization<'a> {
     /// What the outliers of a row add to it, if it has any.
     #[inline(always)]
     fn apart(&self, row: usize) -> Option<&'a [f32]> {
@@ -91,9 +91,9 @@ impl Finish<'_> {
     #[inline(always)]
     fn rows<S: Simd, R: Finishing>(&mut self, simd: S) {
         for (row, (out, sums)) in self.out.iter_mut().zip(self.sums.iter()).enumerate() {
-            match &self.int8 {
+            match &self.quantized {
                 None => float_row::<S, R>(simd, sums, self.bias, out),
-                Some(int8) => int8_row::<S, R>(simd, sums, int8, row, self.bias, out),
+                Some(how) => integer_row::<S, R>(simd, sums, how, row, self.bias, out),
             }
         }
     }
@@ -112,21 +112,21 @@ fn float_row<S: Simd, R: Finishing>(simd: S, sums: &[u32], bias: &[f32], out: &m
 
 /// A row of int32 sums.
 #[inline(always)]
-fn int8_row<S: Simd, R: Finishing>(
+fn integer_row<S: Simd, R: Finishing>(
     simd: S,
     sums: &[u32],
-    int8: &Int8<'_>,
+    how: &Dequantization<'_>,
     row: usize,
     bias: &[f32],
     out: &mut [f32],
 ) {
-    let Quantized { scale, zero } = int8.quantized[row];
+    let Quantized { scale, zero } = how.quantized[row];
     let (scale, zero) = (simd.splat(scale), simd.splat_i32(zero));
-    let mut apart = int8.apart(row).map(|apart| apart.chunks_exact(S::LANES));
-    let columns = int8
+    let mut apart = how.apart(row).map(|apart| apart.chunks_exact(S::LANES));
+    let columns = how
         .scales
         .chunks_exact(S::LANES)
-        .zip(int8.weight_sums.chunks_exact(S::LANES));
+        .zip(how.weight_sums.chunks_exact(S::LANES));
     let sums = sums.chunks_exact(S::LANES).zip(bias.chunks_exact(S::LANES));
     for (out, ((sums, bias), (scales, weight_sums))) in out.chunks_mut(S::LANES).zip(sums.zip(columns)) {
         let scales = simd.load(scales);

@@ -3,8 +3,8 @@
 use crate::aligned::AllocError;
 use crate::pool::Interrupted;
 
-/// In int8, so that no sum overflows: 255 * 127 times this is less than 2^31.
-pub(super) const MAX_INT8_INPUTS: usize = 1 << 16;
+/// In int8 and int4, so that no sum overflows: 255 * 127 times this is less than 2^31.
+pub(super) const MAX_QUANTIZED_INPUTS: usize = 1 << 16;
 
 /// Why a layer was not packed.
 #[derive(Debug, thiserror::Error)]
@@ -29,8 +29,8 @@ pub enum KernelError {
         /// Elements of its bias.
         given: usize,
     },
-    /// int8 weights do not have one scale for each output.
-    #[error("int8 weights of {expected} out_features need as many scales, got {given}")]
+    /// int8 or int4 weights do not have one scale for each output.
+    #[error("quantised weights of {expected} out_features need as many scales, got {given}")]
     Scales {
         /// Outputs of the part.
         expected: usize,
@@ -38,7 +38,7 @@ pub enum KernelError {
         given: usize,
     },
     /// A sum of that many products could overflow.
-    #[error("int8 arithmetic takes at most {MAX_INT8_INPUTS} in_features, got {given}")]
+    #[error("int8 and int4 arithmetic take at most {MAX_QUANTIZED_INPUTS} in_features, got {given}")]
     TooManyInputs {
         /// Of the parts.
         given: usize,

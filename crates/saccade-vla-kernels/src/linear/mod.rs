@@ -24,7 +24,7 @@ use crate::pool::{parallel_for, usable};
 use crate::rows::{Rows, RowsMut, SharedRows};
 use crate::weights::{Arithmetic, Element, WeightRef};
 pub use epilogue::Epilogue;
-use epilogue::{Finish, Int8};
+use epilogue::{Dequantization, Finish};
 pub use error::KernelError;
 use pack::{Panels, check_panel, pack_panels, packed_element};
 pub use rows::LinearScratch;
@@ -79,10 +79,10 @@ const TASKS_PER_THREAD: usize = 4;
 impl PackedLinear {
     /// Packs `parts`, stacked along `out_features`, on `threads` threads; a missing bias is zero.
     ///
-    /// For [`Arithmetic::Float32`] stored as bf16 only if every part is bf16; otherwise widened to f32, which is exact but for int8.
+    /// For [`Arithmetic::Float32`] stored as bf16 only if every part is bf16; otherwise widened to f32, which is exact but for int8 and int4.
     ///
     /// # Errors
-    /// [`KernelError`] if there is no part, the parts do not fit together, there are more than 65536 `in_features` for int8, there is not
+    /// [`KernelError`] if there is no part, the parts do not fit together, there are more than 65536 `in_features` for int8 or int4, there is not
     /// enough memory, or packing was interrupted.
     ///
     /// # Panics
@@ -112,7 +112,7 @@ impl PackedLinear {
                     given: bias.len(),
                 });
             }
-            if let WeightRef::Int8 { scales, .. } = weight
+            if let Some(scales) = weight.scales()
                 && scales.len() != outputs
             {
                 return Err(KernelError::Scales {
@@ -140,7 +140,7 @@ impl PackedLinear {
             }
             column += weight.shape().0;
         }
-        let panels = pack_panels(threads, &*gemm, element == Element::Int8, parts)?;
+        let panels = pack_panels(threads, &*gemm, element, parts)?;
         Ok(Self {
             isa,
             gemm,
@@ -165,13 +165,13 @@ impl PackedLinear {
     }
 
     /// The layer, keeping up to 8 elements of a row out of its quantisation if they are far larger than the others: they are
-    /// multiplied in float32 by the same weights. For [`Arithmetic::Int8`]; no other arithmetic needs it.
+    /// multiplied in float32 by the same weights. For int8 and int4; no other arithmetic needs it.
     ///
     /// Costs a pass over the rows, and for rows that have such elements some percent of the products.
     #[must_use]
     pub fn keeping_outliers(self) -> Self {
         Self {
-            keeps_outliers: self.element == Element::Int8,
+            keeps_outliers: self.element.is_quantized(),
             ..self
         }
     }
@@ -196,8 +196,8 @@ impl PackedLinear {
         }
         let gemm = isa.gemm(arithmetic, element);
         let columns = gemm.shape().nr;
-        // A bias for each column; for int8 also a scale and a sum.
-        let words_of_column = if element == Element::Int8 { 3 } else { 1 };
+        // A bias for each column; for int8 and int4 also a scale and a sum.
+        let words_of_column = if element.is_quantized() { 3 } else { 1 };
         let panel = gemm
             .panel_words(in_features)
             .saturating_add(columns * words_of_column);
@@ -250,8 +250,7 @@ impl PackedLinear {
 
     /// `out = epilogue(x W^T + bias)` for rows `x (rows, in_features)` and `out (rows, out_features)`, both row-major with any row stride.
     ///
-    /// For [`Arithmetic::Bfloat16`] and [`Arithmetic::Int8`] the rows are converted first, into `scratch`. A row with NaN or infinity gives NaN
-    /// for int8.
+    /// For all but [`Arithmetic::Float32`] the rows are converted first, into `scratch`. A row with NaN or infinity gives NaN for int8 and int4.
     ///
     /// # Errors
     /// [`AllocError`] if `scratch` has to grow and there is not enough memory.
@@ -306,10 +305,10 @@ impl PackedLinear {
             epilogue,
         };
         if let Some(stride) = self.gemm.converted_stride(self.in_features) {
-            let conversion = match (self.element, self.keeps_outliers) {
-                (Element::Int8, true) => RowConversion::QuantizedWithoutOutliers,
-                (Element::Int8, false) => RowConversion::Quantized,
-                _ => RowConversion::Rounded,
+            let conversion = match (self.element.is_quantized(), self.keeps_outliers) {
+                (true, true) => RowConversion::QuantizedWithoutOutliers,
+                (true, false) => RowConversion::Quantized,
+                (false, _) => RowConversion::Rounded,
             };
             let converted = scratch.convert(&*self.gemm, stride, conversion, threads, x)?;
             call.x = converted.words;
@@ -391,11 +390,12 @@ impl PackedLinear {
                 panel: weights,
                 columns,
                 run: 1,
+                has_nibbles: false,
                 sums: apart,
             });
         }
         let of_panel = first..first + columns;
-        let int8 = (self.element == Element::Int8).then(|| Int8 {
+        let quantized = self.element.is_quantized().then(|| Dequantization {
             scales: &self.panels.scales[of_panel.clone()],
             weight_sums: &self.panels.sums[of_panel.clone()],
             quantized: &call.quantized[rows.clone()],
@@ -410,7 +410,7 @@ impl PackedLinear {
             epilogue: call.epilogue,
             sums,
             bias: &self.bias[of_panel],
-            int8,
+            quantized,
             out,
         });
     }

@@ -1,27 +1,28 @@
 //! From weights as they are stored to panels, on several threads.
 
-use super::error::{KernelError, MAX_INT8_INPUTS};
+use super::error::{KernelError, MAX_QUANTIZED_INPUTS};
 use crate::aligned::{AlignedBuffer, AllocError, elements};
 use crate::gemm::{Gemm, MAX_NR, PanelMut};
+use crate::matrix::Matrix;
 use crate::pool::{Interrupted, is_stopped, parallel_for};
 use crate::rows::{RowsMut, SharedRows};
-use crate::weights::{Arithmetic, Element, WeightRef};
+use crate::weights::{Arithmetic, Element, WeightRef, nibbles};
 
 /// Packed weights.
 pub(super) struct Panels {
     /// One after the other.
     pub words: AlignedBuffer<u32>,
-    /// Of each column of the panels, for int8: its scale; otherwise empty.
+    /// Of each column of the panels, for int8 and int4: its scale; otherwise empty.
     pub scales: AlignedBuffer<f32>,
-    /// The sum of its weights, likewise.
+    /// The sum of its bytes, likewise.
     pub sums: AlignedBuffer<i32>,
 }
 
-/// Packs `parts`, stacked along `out_features`, as panels of `gemm`; with scales if it is one of int8.
+/// Packs `parts`, stacked along `out_features`, as panels of `gemm`, which are of `element`.
 pub(super) fn pack_panels(
     threads: usize,
     gemm: &dyn Gemm,
-    is_int8: bool,
+    element: Element,
     parts: &[(WeightRef<'_>, Option<&[f32]>)],
 ) -> Result<Panels, KernelError> {
     let columns = gemm.shape().nr;
@@ -29,26 +30,29 @@ pub(super) fn pack_panels(
     let out_features: usize = parts.iter().map(|(weight, _)| weight.shape().0).sum();
     let num_panels = out_features.div_ceil(columns);
     let size = gemm.panel_words(in_features);
-    let int8 = if is_int8 { columns } else { 0 };
+    let scaled = if element.is_quantized() { columns } else { 0 };
+    let of_bytes = |(weight, _): &(WeightRef<'_>, _)| bytes_for(element, weight);
+    let bytes = parts.iter().map(of_bytes).collect::<Result<Vec<_>, _>>()?;
     let mut words = AlignedBuffer::zeroed(elements(num_panels, size)?)?;
-    let mut scales = AlignedBuffer::zeroed(num_panels * int8)?;
-    let mut sums = AlignedBuffer::zeroed(num_panels * int8)?;
+    let mut scales = AlignedBuffer::zeroed(num_panels * scaled)?;
+    let mut sums = AlignedBuffer::zeroed(num_panels * scaled)?;
     let to_words = SharedRows::new(RowsMut::strided(&mut words, num_panels, size, size));
-    let to_scales = SharedRows::new(RowsMut::strided(&mut scales, num_panels, int8, int8));
-    let to_sums = SharedRows::new(RowsMut::strided(&mut sums, num_panels, int8, int8));
+    let to_scales = SharedRows::new(RowsMut::strided(&mut scales, num_panels, scaled, scaled));
+    let to_sums = SharedRows::new(RowsMut::strided(&mut sums, num_panels, scaled, scaled));
     parallel_for(threads, num_panels, &|index| {
         let panel = index..index + 1;
         // SAFETY: tasks have different panels.
         let (mut words, mut scales, mut sums) = unsafe {
             (
                 to_words.block(panel.clone(), 0..size),
-                to_scales.block(panel.clone(), 0..int8),
-                to_sums.block(panel, 0..int8),
+                to_scales.block(panel.clone(), 0..scaled),
+                to_sums.block(panel, 0..scaled),
             )
         };
         let (first, end) = (index * columns, (index + 1) * columns);
         let mut part_first = 0;
-        for (weight, _) in parts {
+        for ((weight, _), bytes) in parts.iter().zip(&bytes) {
+            let weight = as_bytes(*weight, bytes.as_deref());
             let part_end = part_first + weight.shape().0;
             let (from, until) = (part_first.max(first), part_end.min(end));
             if from < until {
@@ -86,11 +90,45 @@ pub(super) fn packed_element(
 ) -> Result<Element, KernelError> {
     match arithmetic {
         Arithmetic::Float32 if are_bf16 => Ok(Element::Bf16),
-        Arithmetic::Float32 => Ok(Element::F32),
-        Arithmetic::Bfloat16 => Ok(Element::Bf16),
-        Arithmetic::Int8 if in_features > MAX_INT8_INPUTS => {
+        Arithmetic::Int8 | Arithmetic::Int4 if in_features > MAX_QUANTIZED_INPUTS => {
             Err(KernelError::TooManyInputs { given: in_features })
         }
-        Arithmetic::Int8 => Ok(Element::Int8),
+        _ => Ok(arithmetic.element()),
+    }
+}
+
+/// A byte for each weight, if they are int4 and to be packed as something else.
+fn bytes_for(element: Element, weight: &WeightRef<'_>) -> Result<Option<AlignedBuffer<i8>>, AllocError> {
+    let WeightRef::Int4 {
+        values, in_features, ..
+    } = *weight
+    else {
+        return Ok(None);
+    };
+    if element == Element::Int4 {
+        return Ok(None);
+    }
+    let mut bytes = AlignedBuffer::zeroed(elements(values.num_rows(), in_features)?)?;
+    for (row, bytes) in bytes.chunks_exact_mut(in_features.max(1)).enumerate() {
+        for (k, bytes) in bytes.chunks_mut(2).enumerate() {
+            bytes.copy_from_slice(&nibbles(values.get(row, k))[..bytes.len()]);
+        }
+    }
+    Ok(Some(bytes))
+}
+
+/// The weights that `bytes` are made of, or those that are given where there are none.
+fn as_bytes<'a>(weight: WeightRef<'a>, bytes: Option<&'a [i8]>) -> WeightRef<'a> {
+    match (weight, bytes) {
+        (
+            WeightRef::Int4 {
+                in_features, scales, ..
+            },
+            Some(bytes),
+        ) => WeightRef::Int8 {
+            values: Matrix::new(bytes, in_features),
+            scales,
+        },
+        _ => weight,
     }
 }

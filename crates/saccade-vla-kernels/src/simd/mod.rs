@@ -21,6 +21,9 @@ pub(crate) const MAX_LANES: usize = 16;
 /// Words of a cache line.
 pub(crate) const LINE: usize = 16;
 
+/// The high half of each byte of a word.
+pub(crate) const HIGH_NIBBLES: i32 = 0xf0f0_f0f0_u32.cast_signed();
+
 /// Rows of the largest tile of any instruction set.
 pub(crate) const MAX_TILE_ROWS: usize = 8;
 
@@ -103,6 +106,10 @@ pub(crate) trait Simd: Copy + Send + Sync + 'static {
     fn low_halves(self, pairs: Self::I32) -> Self::F32;
     /// The high half of each word, likewise.
     fn high_halves(self, pairs: Self::I32) -> Self::F32;
+    /// The low half of each byte as a signed byte that is 16 times as large: int4 widened.
+    fn low_nibbles(self, words: Self::I32) -> Self::I32;
+    /// The high half, likewise.
+    fn high_nibbles(self, words: Self::I32) -> Self::I32;
     /// Rounded to bfloat16, to nearest and ties to even; NaN stays.
     fn round_to_bf16(self, x: Self::F32) -> Self::F32;
 
@@ -319,6 +326,8 @@ macro_rules! token {
                 fn to_f32(x: Self::I32) -> Self::F32 = to_f32;
                 fn low_halves(pairs: Self::I32) -> Self::F32 = low_halves;
                 fn high_halves(pairs: Self::I32) -> Self::F32 = high_halves;
+                fn low_nibbles(words: Self::I32) -> Self::I32 = low_nibbles;
+                fn high_nibbles(words: Self::I32) -> Self::I32 = high_nibbles;
                 fn round_to_bf16(x: Self::F32) -> Self::F32 = round_to_bf16;
                 fn load_rest(from: &[f32]) -> Self::F32 = load_rest;
                 fn store_rest(x: Self::F32, to: &mut [f32]) = store_rest;

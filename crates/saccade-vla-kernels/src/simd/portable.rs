@@ -3,7 +3,7 @@
 use half::bf16;
 
 use super::bits::cast;
-use super::{Kernel, Simd};
+use super::{HIGH_NIBBLES, Kernel, Simd};
 
 /// Plain loops; every CPU runs them.
 pub(crate) type Portable = Loops<8>;
@@ -113,6 +113,8 @@ impl<const N: usize> Simd for Loops<N> {
         fn to_f32(x: Self::I32) -> Self::F32 = x.map(|x| x as f32);
         fn low_halves(pairs: Self::I32) -> Self::F32 = pairs.map(|pair| f32::from_bits((pair as u32) << 16));
         fn high_halves(pairs: Self::I32) -> Self::F32 = pairs.map(|pair| f32::from_bits(pair as u32 & 0xffff_0000));
+        fn low_nibbles(words: Self::I32) -> Self::I32 = words.map(|word| word << 4 & HIGH_NIBBLES);
+        fn high_nibbles(words: Self::I32) -> Self::I32 = words.map(|word| word & HIGH_NIBBLES);
         fn round_to_bf16(x: Self::F32) -> Self::F32 = x.map(|x| bf16::from_f32(x).to_f32());
         fn to_bf16_pairs(first: Self::F32, second: Self::F32) -> Self::I32 = {
             let bits = [first, second].map(|x| x.map(|x| bf16::from_f32(x).to_bits()));

@@ -57,7 +57,12 @@ const EPILOGUES: [Epilogue; 7] = [
     Epilogue::Mul,
 ];
 
-const ARITHMETICS: [Arithmetic; 3] = [Arithmetic::Float32, Arithmetic::Bfloat16, Arithmetic::Int8];
+const ARITHMETICS: [Arithmetic; 4] = [
+    Arithmetic::Float32,
+    Arithmetic::Bfloat16,
+    Arithmetic::Int8,
+    Arithmetic::Int4,
+];
 
 /// A layer and its rows.
 struct Layer {
@@ -170,7 +175,11 @@ impl Layer {
             let x_step = x.iter().fold(0.0, |largest: f64, value| largest.max(value.abs())) / 63.0;
             for output in 0..self.outputs {
                 let bias = self.bias.as_ref().map_or(0.0, |bias| f64::from(bias[output]));
-                let w_step = largest[output] / 254.0 * (1.0 + 1e-6);
+                // Half a step of the weights at least; weights of four bits may be clipped, and are then further off.
+                let w_step = match arithmetic {
+                    Arithmetic::Int4 => largest[output] * 7.5 / 12.0,
+                    _ => largest[output] / 254.0,
+                } * (1.0 + 1e-6);
                 let (mut sum, mut magnitude, mut error) = (bias, bias.abs(), 0.0);
                 for (input, &x) in x.iter().enumerate() {
                     let w = f64::from(self.weight(output, input));
@@ -180,7 +189,9 @@ impl Layer {
                         Arithmetic::Float32 => 0.0,
                         // The weights are exact.
                         Arithmetic::Bfloat16 => BF16_ROUNDING * (w * x).abs(),
-                        Arithmetic::Int8 => w_step * x.abs() + x_step * w.abs() + w_step * x_step,
+                        Arithmetic::Int8 | Arithmetic::Int4 => {
+                            w_step * x.abs() + x_step * w.abs() + w_step * x_step
+                        }
                     };
                 }
                 error += gamma(self.inputs + 8) * (magnitude + error);

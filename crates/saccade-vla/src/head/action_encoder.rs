@@ -201,6 +201,7 @@ fn widened(weight: WeightRef<'_>) -> Mat<f64> {
         WeightRef::F32(view) => f64::from(view.get(i, j)),
         WeightRef::Bf16(view) => view.get(i, j).to_f64(),
         WeightRef::Int8 { values, scales } => f64::from(values.get(i, j)) * f64::from(scales[i]),
+        WeightRef::Int4 { .. } => unreachable!("category-specific weights are checked to be floating point"),
     })
 }
 

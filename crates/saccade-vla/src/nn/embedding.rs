@@ -33,6 +33,7 @@ impl Embedding {
                     *out = element.to_f32();
                 }
             }
+            Elements::Int4 { .. } => unreachable!("tables are floating point or int8"),
             Elements::Int8 { values, scales } => {
                 for (out, value) in out.iter_mut().zip(&values[row]) {
                     *out = f32::from(*value) * scales[id];

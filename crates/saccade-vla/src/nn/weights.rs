@@ -70,7 +70,7 @@ impl Weights<'_> {
     pub(crate) fn weight(&self, role: Role, shape: &[usize]) -> Result<Tensor> {
         let weight = self.read(Request {
             spec: TensorSpec {
-                may_be_int8: role.is_given_back(),
+                may_be_quantized: role.is_given_back(),
                 ..TensorSpec::plain(&self.name("weight"), shape)
             },
             slices: None,
@@ -219,6 +219,22 @@ fn quantized(table: &Elements, [num_rows, width]: [usize; 2]) -> Result<Tensor> 
     Ok(Tensor::Held(Elements::Int8 { values, scales }))
 }
 
+/// Checks that nothing follows the last weight of a row of int4, where their number is odd: it would be multiplied.
+fn check_padding(request: &Request, values: &[u8]) -> Result<()> {
+    let spec = &request.spec;
+    let in_features: usize = spec.shape[1..].iter().product();
+    let is_padded = |row: &[u8]| row.last().is_none_or(|last| last >> 4 == 0);
+    let bad = values
+        .chunks_exact(in_features.div_ceil(2).max(1))
+        .position(|row| in_features % 2 == 1 && !is_padded(row));
+    match bad {
+        None => Ok(()),
+        Some(row) => Err(Error::Checkpoint(problem!(
+            &spec.name; "row {row} has {in_features} weights of four bits, expected zero in the high half of its last byte"
+        ))),
+    }
+}
+
 /// Checks that weights are finite. One that is not spoils every action, without a sign of where it comes
 /// from.
 fn check_finite(request: &Request, elements: &Elements) -> Result<()> {
@@ -231,8 +247,9 @@ fn check_finite(request: &Request, elements: &Elements) -> Result<()> {
             None => return Ok(()),
             Some(position) => (position, values[position].to_f32()),
         },
-        // Scales are checked where they are read.
+        // Values and scales are checked where they are read.
         Elements::Int8 { .. } => return Ok(()),
+        Elements::Int4 { values, .. } => return check_padding(request, values),
     };
     let spec = &request.spec;
     let first = request.slices.as_ref().map_or(0, |slices| slices.start);

@@ -1,6 +1,6 @@
 //! Sizes of a head from the shapes of its tensors.
 
-use saccade_vla_checkpoint::Checkpoint;
+use saccade_vla_checkpoint::{Checkpoint, Dtype};
 use serde_json::{Value, json};
 
 use crate::config::Object;
@@ -9,6 +9,9 @@ use crate::release::{Feature, Version};
 
 /// The name, without a prefix, of the future tokens.
 pub(crate) const FUTURE_TOKENS: &str = "future_tokens.weight";
+
+/// The projection of the vision-language tokens to keys, in the first block.
+const CROSS_KEYS: &str = "model.transformer_blocks.0.attn1.to_k.weight";
 
 const DECODER: &str = "action_decoder";
 const ARM: &str = "action_arm_decoder";
@@ -27,11 +30,22 @@ impl HeadShapes<'_> {
         self.checkpoint.shape(&format!("{}{name}", self.prefix))
     }
 
-    /// The size of tensor `name` on `axis`, if it is there with `axes` axes.
+    /// The size of tensor `name` on `axis`, if it is there with `axes` axes. Rows of int4 have two elements in a byte: of an odd
+    /// number the size is one more.
     pub(super) fn size(&self, name: &str, axes: usize, axis: usize) -> Option<usize> {
+        let per_element = if axis + 1 == axes && self.is_int4(name) {
+            2
+        } else {
+            1
+        };
         self.shape(name)
             .filter(|shape| shape.len() == axes)
-            .map(|shape| shape[axis])
+            .map(|shape| shape[axis].saturating_mul(per_element))
+    }
+
+    fn is_int4(&self, name: &str) -> bool {
+        let dtype = self.checkpoint.dtype(&format!("{}{name}", self.prefix));
+        matches!(dtype, Ok(Dtype::U8))
     }
 
     /// Whether a tensor's name begins with `start`.
@@ -76,12 +90,7 @@ pub(super) fn proved(version: Version, tensors: &HeadShapes<'_>) -> Vec<(&'stati
     add("hidden_size", "state_encoder.layer1.W", 3, 2);
     add("max_num_embodiments", "state_encoder.layer1.W", 3, 0);
     add("max_seq_len", "position_embedding.weight", 2, 0);
-    add(
-        "backbone_embedding_dim",
-        "model.transformer_blocks.0.attn1.to_k.weight",
-        2,
-        1,
-    );
+    add("backbone_embedding_dim", CROSS_KEYS, 2, 1);
     let action_dim = match (version.is_flat(), tensors.has_several_decoders()) {
         (true, _) => "max_action_dim",
         (false, true) => "pretrained_action_dim",
@@ -120,8 +129,10 @@ pub(super) fn complete(head: &Object, version: Version, tensors: &HeadShapes<'_>
     add_decoders(&mut head, tensors);
     let mut problems = Vec::new();
     for (key, size, shown) in proved(version, tensors) {
+        // Whether it is odd is not told by int4; all shapes are compared with the config's later.
+        let may_be_less = key == "backbone_embedding_dim" && tensors.is_int4(CROSS_KEYS);
         match head.get(key).map(Value::as_u64) {
-            Some(Some(given)) if given != size as u64 => {
+            Some(Some(given)) if given != size as u64 && !(may_be_less && given + 1 == size as u64) => {
                 problems.push(format!("{key} is {given} in the config, but {shown}"));
             }
             // `HeadConfig` refuses values that are no numbers.

@@ -4,8 +4,8 @@ use std::collections::BTreeSet;
 use std::ops::Range;
 use std::path::{Path, PathBuf};
 
-use saccade_vla_checkpoint::spec::SCALE_SUFFIX;
-use saccade_vla_checkpoint::{Checkpoint, CheckpointWriter, Dtype, PlannedTensor};
+use saccade_vla_checkpoint::spec::{SCALE_SUFFIX, is_quantized};
+use saccade_vla_checkpoint::{Checkpoint, CheckpointWriter, PlannedTensor};
 
 use crate::error::{Error, Result, ensure, problem};
 use crate::head::embodiments::chosen_embodiments;
@@ -25,7 +25,7 @@ pub struct ConvertOptions {
     /// Keep only these embodiments; default all. They keep their ids: the slices of the others become zero, and the files' metadata list
     /// those that were kept.
     pub embodiment_ids: Option<Vec<i64>>,
-    /// The type of all floating-point tensors; default the one that each has. int8 and its scales stay, and so do the
+    /// The type of all floating-point tensors; default the one that each has. int8, int4 and their scales stay, and so do the
     /// probabilities of dropping a state, since one that is rounded up to 1 would act.
     pub dtype: Option<Float>,
     /// The directory of a LoRA adapter to merge into the weights, in their type in the copy. Its statistics and processors take the place of the
@@ -181,7 +181,7 @@ fn change(source: &SourceCheckpoint, name: &str, options: &ConvertOptions) -> Re
     let is_state_dropout = name.strip_prefix(source.prefix) == Some(STATE_DROPOUT);
     let is_scale = name
         .strip_suffix(SCALE_SUFFIX)
-        .is_some_and(|scaled| matches!(source.checkpoint.dtype(scaled), Ok(Dtype::I8)));
+        .is_some_and(|scaled| matches!(source.checkpoint.dtype(scaled), Ok(dtype) if is_quantized(dtype)));
     Ok(from
         .zip(options.dtype)
         .filter(|(from, to)| from != to && !is_scale && !is_state_dropout))

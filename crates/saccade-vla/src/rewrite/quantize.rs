@@ -1,18 +1,19 @@
-//! Quantised checkpoints: the weights that are multiplied in int8, stored as int8.
+//! Quantised checkpoints: the weights that are multiplied in int8 or int4, stored so.
 
 use std::collections::BTreeSet;
 use std::path::Path;
 
-use saccade_vla_checkpoint::spec::SCALE_SUFFIX;
-use saccade_vla_checkpoint::{Checkpoint, CheckpointWriter, Dtype, PlannedTensor, TensorSpec, reserve};
-use saccade_vla_kernels::quantize_rows;
+use saccade_vla_checkpoint::spec::{SCALE_SUFFIX, is_quantized};
+use saccade_vla_checkpoint::{Checkpoint, CheckpointWriter, Dtype, PlannedTensor, TensorSpec};
+use saccade_vla_kernels::{quantize_rows, quantize_rows_int4};
 
 use crate::alloc::filled;
 use crate::backbone::BackboneCheckpoint;
-use crate::error::{Error, Result, bail};
+use crate::error::{Error, Result, bail, ensure};
 use crate::head::plan::tensor_specs;
 use crate::nn::source::weight_view;
 use crate::ops::check_interrupted;
+use crate::precision::Precision;
 use crate::rewrite::float::Float;
 use crate::rewrite::{RewriteOptions, SourceCheckpoint, Written};
 
@@ -39,18 +40,19 @@ pub struct QuantizeReport {
     pub backbone_copied: Option<String>,
 }
 
-/// Writes the checkpoint `source` to the directory `out` with the weights of the blocks' linear layers in int8, `X.weight (out, in)`
-/// and float32 `X.weight_scale (out)`, by [`quantize_rows`]: what [`Precision::Int8`](crate::Precision::Int8) computes with, so that
-/// loading the result at that precision gives the same bits as loading `source` at it. So are the blocks of a backbone, if there is one that
-/// [`Backbone`](crate::Backbone) loads. All other tensors are copied bit for bit.
+/// Writes the checkpoint `source` to the directory `out` with the weights of the blocks' linear layers in the precision `to`: int8 as I8
+/// `X.weight (out, in)` by [`quantize_rows`], or int4 as U8 `X.weight (out, in / 2)`, rounded up, by [`quantize_rows_int4`]; and float32
+/// `X.weight_scale (out)`. That is what [`Precision::Int8`] and [`Precision::Int4`] compute with, so that loading the result at that precision
+/// gives the same bits as loading `source` at it. So are the blocks of a backbone, if there is one that [`Backbone`](crate::Backbone) loads.
+/// All other tensors are copied bit for bit.
 ///
 /// One tensor is in memory at a time. `progress(done, total)`, in bytes read, is called after each tensor; if it returns false, nothing is
 /// written.
 ///
 /// ```
 /// # let out = std::env::temp_dir().join(format!("saccade-quantize-{}", std::process::id()));
-/// use saccade_vla::{ActionHead, LoadOptions, RewriteOptions, quantize};
-/// let report = quantize("examples/tiny".as_ref(), &out, &RewriteOptions::default(), |_, _| true)?;
+/// use saccade_vla::{ActionHead, LoadOptions, Precision, RewriteOptions, quantize};
+/// let report = quantize("examples/tiny".as_ref(), &out, Precision::Int4, &RewriteOptions::default(), |_, _| true)?;
 /// ActionHead::load(&out, &LoadOptions::default())?;
 /// # std::fs::remove_dir_all(&out).ok();
 /// # Ok::<(), saccade_vla::Error>(())
@@ -58,14 +60,16 @@ pub struct QuantizeReport {
 ///
 /// # Errors
 /// Of kind [`Checkpoint`](crate::ErrorKind::Checkpoint) for a source that is broken, does not fit its config or is quantised already, and for
-/// weights of the head that are not finite; [`Input`](crate::ErrorKind::Input) if `out` exists and `force` is not set, holds anything but a
+/// weights of the head that are not finite; [`Input`](crate::ErrorKind::Input) if `to` is another precision, `out` exists and `force` is not set, holds anything but a
 /// checkpoint, or is the source; [`Output`](crate::ErrorKind::Output) if it cannot be written.
 pub fn quantize(
     source: &Path,
     out: &Path,
+    to: Precision,
     options: &RewriteOptions,
     mut progress: impl FnMut(u64, u64) -> bool,
 ) -> Result<QuantizeReport> {
+    ensure!(to.quantizes(), Input, "to"; expected "'int8' or 'int4'"; got "'{to}'");
     let source = SourceCheckpoint::open(source, options.config.as_deref())?;
     let backbone = backbone_of(&source, options)?;
     let head_specs = tensor_specs(&source.config)?;
@@ -76,12 +80,12 @@ pub fn quantize(
     if let Some(backbone) = of_backbone {
         weights.add(backbone.prefix(), backbone.specs());
     }
-    if let Some(name) = weights
-        .int8
-        .iter()
-        .find(|name| matches!(source.checkpoint.dtype(name), Ok(Dtype::I8)))
-    {
-        bail!(Checkpoint, "source"; "it is quantised already: {name} is I8, expected F32, BF16 or F16");
+    for name in &weights.quantized {
+        if let Ok(dtype) = source.checkpoint.dtype(name)
+            && is_quantized(dtype)
+        {
+            bail!(Checkpoint, "source"; "it is quantised already: {name} is {dtype:?}, expected F32, BF16 or F16");
+        }
     }
     let mut planned = Vec::new();
     let mut report = QuantizeReport {
@@ -91,10 +95,15 @@ pub fn quantize(
     for name in source.names(options) {
         let mut tensors = vec![source.as_it_is(name)?];
         let is_backbone = backbone_prefix.is_some_and(|prefix| name.starts_with(prefix));
-        if weights.int8.contains(name) {
+        if weights.quantized.contains(name) {
             report.num_quantized += 1;
             report.num_quantized_backbone += usize::from(is_backbone);
-            tensors[0].dtype = Dtype::I8;
+            if to == Precision::Int4 {
+                tensors[0].dtype = Dtype::U8;
+                tensors[0].shape[1] = tensors[0].shape[1].div_ceil(2);
+            } else {
+                tensors[0].dtype = Dtype::I8;
+            }
             tensors.push(PlannedTensor {
                 name: format!("{name}{SCALE_SUFFIX}"),
                 dtype: Dtype::F32,
@@ -121,8 +130,8 @@ pub fn quantize(
         &config,
         planned,
         &mut progress,
-        |name, writer| match weights.int8.contains(name) {
-            true => write_quantized(&source.checkpoint, name, source.shape(name), writer),
+        |name, writer| match weights.quantized.contains(name) {
+            true => write_quantized(&source, name, to, writer),
             false if weights.all.contains(name) => copy_finite(&source.checkpoint, name, writer),
             false => source.copy(name, writer),
         },
@@ -134,16 +143,16 @@ pub fn quantize(
 #[derive(Default)]
 struct Names {
     all: BTreeSet<String>,
-    /// Those that may be stored as int8.
-    int8: BTreeSet<String>,
+    /// Those that may be stored as int8 or int4.
+    quantized: BTreeSet<String>,
 }
 
 impl Names {
     fn add(&mut self, prefix: &str, specs: &[TensorSpec]) {
         for spec in specs {
             let name = format!("{prefix}{}", spec.name);
-            if spec.may_be_int8 {
-                self.int8.insert(name.clone());
+            if spec.may_be_quantized {
+                self.quantized.insert(name.clone());
             }
             self.all.insert(name);
         }
@@ -171,29 +180,31 @@ fn backbone_of(
 }
 
 fn write_quantized(
-    checkpoint: &Checkpoint,
+    source: &SourceCheckpoint,
     name: &str,
-    shape: &[usize],
+    to: Precision,
     writer: &mut CheckpointWriter,
 ) -> Result<()> {
-    let [out_features, in_features] = *shape else {
+    let [out_features, in_features] = *source.shape(name) else {
         unreachable!("a linear layer's weight has two axes")
     };
     check_interrupted()?;
-    let weight = checkpoint.read(name)?;
-    let mut values: Vec<i8> = Vec::new();
-    reserve("source", &mut values, out_features * in_features)?;
-    values.resize(out_features * in_features, 0);
+    let weight = source.checkpoint.read(name)?;
+    let weight = weight_view(&weight, out_features, in_features);
     let mut scales = filled("source", out_features, 0.0)?;
-    quantize_rows(
-        weight_view(&weight, out_features, in_features),
-        &mut values,
-        &mut scales,
-    );
+    let bytes = if to == Precision::Int4 {
+        let mut values = filled("source", out_features * in_features.div_ceil(2), 0_u8)?;
+        quantize_rows_int4(weight, &mut values, &mut scales);
+        values
+    } else {
+        let mut values = filled("source", out_features * in_features, 0_i8)?;
+        quantize_rows(weight, &mut values, &mut scales);
+        bytemuck::cast_vec(values)
+    };
     if let Some(row) = scales.iter().position(|scale| !(127.0 * scale).is_finite()) {
         bail!(Checkpoint, "source"; "{name} holds NaN or infinity in row {row}, expected finite weights");
     }
-    writer.tensor(name, bytemuck::cast_slice(&values))?;
+    writer.tensor(name, &bytes)?;
     let scales: Vec<u8> = scales.into_iter().flat_map(f32::to_le_bytes).collect();
     Ok(writer.tensor(&format!("{name}{SCALE_SUFFIX}"), &scales)?)
 }

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from saccade._internal.arrays import Float32Array
+from saccade._internal.arrays import PRECISIONS, Float32Array
 from saccade.errors import InputError
 from saccade.head.context import Context
 from saccade.head.head import ActionHead
@@ -22,7 +22,6 @@ BoolArray = npt.NDArray[np.bool_]
 #: Noisy actions ``(1, horizon, encoder_action_dim)`` and a time in 0..1 -> ``(1, horizon, action_dim)``.
 Velocity = Callable[[Float32Array, float], npt.NDArray[np.floating[Any]]]
 
-PRECISIONS = ("float32", "bfloat16", "int8")
 INTEGRATORS = {"euler": 1, "midpoint": 2, "heun": 2, "adams": 1, "times": 1}  # evaluations per step
 OF_THE_HEAD = ("euler", "midpoint")  # the others are computed here, from `ActionHead.velocity`
 EXACT_STEPS = 16  # of the midpoint rule: the reference for small steps

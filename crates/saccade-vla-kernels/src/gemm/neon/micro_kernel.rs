@@ -13,6 +13,7 @@ use std::ops::Range;
 #[cfg(feature = "peak")]
 use crate::gemm::elements::F32;
 use crate::gemm::elements::{Elements, RowElements, SumVector, Sums};
+use crate::gemm::nibbles::Unpack;
 use crate::gemm::step::{MicroKernel, Step};
 use crate::gemm::{Block, SUM_PART, Shape};
 use crate::simd::bits::cast;
@@ -33,10 +34,11 @@ const BLOCK_WORDS: usize = 12 << 10;
 /// Words of a vector.
 pub(super) const VECTOR: usize = 4;
 
-/// Words of weights that are widened at a time: the sums of a part.
+/// Words of weights that are widened at a time: the sums of a part. As many of int8 are unpacked from nibbles, an even
+/// number of steps.
 const MAX_WIDENED: usize = SUM_PART * COLUMNS;
 
-/// Words of a panel for a step.
+/// Words of a panel for a step; of nibbles half as many.
 const fn panel_step<E: Step<Lanes>>() -> usize {
     COLUMNS * E::DEPTH / E::PER_WORD
 }
@@ -66,14 +68,19 @@ unsafe impl MicroKernel for Lanes {
     }
 
     #[inline(always)]
-    unsafe fn multiply<S: Simd, E: Step<Self>>(simd: S, block: &Block<'_>, sums: &mut [MaybeUninit<u32>]) {
+    unsafe fn multiply<S: Simd, E: Step<Self>>(
+        simd: S,
+        block: &Block<'_>,
+        has_nibbles: bool,
+        sums: &mut [MaybeUninit<u32>],
+    ) {
         let sums = sums.as_mut_ptr().cast();
         // SAFETY: the contract of this function, and `sums` has room for the rows of the block. Vectors of
         // sums are of four columns of a row, or of two columns of two.
         unsafe {
             match E::GROUP {
-                1 => panel_rows::<S, E, 3>(simd, block, sums),
-                _ => panel_rows::<S, E, 6>(simd, block, sums),
+                1 => panel_rows::<S, E, 3>(simd, block, has_nibbles, sums),
+                _ => panel_rows::<S, E, 6>(simd, block, has_nibbles, sums),
             }
         }
     }
@@ -123,28 +130,42 @@ unsafe fn peak<S: Simd, E: Step<Lanes>, const NV: usize, const MR: usize>(simd: 
 /// # Safety
 /// As [`MicroKernel::multiply`]; `sums` has room for the rows of the block.
 #[inline(always)]
-unsafe fn panel_rows<S: Simd, E: Step<Lanes>, const NV: usize>(simd: S, block: &Block<'_>, sums: *mut u32) {
+unsafe fn panel_rows<S: Simd, E: Step<Lanes>, const NV: usize>(
+    simd: S,
+    block: &Block<'_>,
+    has_nibbles: bool,
+    sums: *mut u32,
+) {
     const { assert!(groups::<E>() >= 4 && S::LANES == VECTOR && step_words::<E>() <= VECTOR * COLUMNS) }
+    let has_nibbles = E::ARE_BYTES && has_nibbles;
     let mut widened = [const { MaybeUninit::<u32>::uninit() }; MAX_WIDENED];
     let first_row = block.rows().start;
     let steps = block.in_features.div_ceil(E::DEPTH);
-    let block_steps = if E::IS_WIDENED {
-        SUM_PART / E::DEPTH
+    let block_steps = if E::IS_WIDENED || has_nibbles {
+        MAX_WIDENED / step_words::<E>()
     } else {
         BLOCK_WORDS / step_words::<E>()
     };
     for part in 0..steps.div_ceil(block_steps).max(1) {
         let part = part * block_steps..steps.min((part + 1) * block_steps);
-        let panel = &block.weights[part.start * panel_step::<E>()..part.end * panel_step::<E>()];
-        let weights = if E::IS_WIDENED {
-            widen(simd, panel, &mut widened)
+        let words = part.start * panel_step::<E>()..part.end * panel_step::<E>();
+        let weights = if has_nibbles {
+            // Two rows of words are one; of the last, the second is perhaps empty.
+            let row = COLUMNS * E::GROUP;
+            let panel = &block.weights[words.start / 2..words.end.div_ceil(2 * row) * row];
+            let to = &mut widened;
+            simd.run(&mut Unpack { panel, row, to });
+            widened.as_ptr().cast()
+        } else if E::IS_WIDENED {
+            widen(simd, &block.weights[words], &mut widened)
         } else {
-            panel.as_ptr()
+            block.weights[words].as_ptr()
         };
         for call in block.calls.clone() {
             let rows = block.split.rows(&(call..call + 1));
             let tile = Tile {
                 weights,
+                panel_step: panel_step::<E>() / if has_nibbles { 2 } else { 1 },
                 sums: sums.wrapping_add((rows.start - first_row) * COLUMNS),
                 call: call - block.calls.start,
                 rows,
@@ -186,11 +207,12 @@ fn widen<S: Simd>(simd: S, panel: &[u32], to: &mut [MaybeUninit<u32>]) -> *const
     to.as_ptr().cast()
 }
 
-/// A tile of sums: its rows, the weights of the part, where its sums go, and its number among those of the
-/// block.
+/// A tile of sums: its rows, the weights of the part, how many words of the panel a step of them was, where its sums
+/// go, and its number among those of the block.
 struct Tile {
     rows: Range<usize>,
     weights: *const u32,
+    panel_step: usize,
     sums: *mut u32,
     call: usize,
 }
@@ -216,8 +238,8 @@ unsafe fn tile_part<S: Simd, E: Step<Lanes>, const NV: usize, const MR: usize>(
     let mut next = block
         .weights
         .as_ptr()
-        .wrapping_add(block.ahead * size + size * tile.call / calls + part.start * panel_step::<E>() / calls);
-    let pitch = panel_step::<E>().div_ceil(calls);
+        .wrapping_add(block.ahead * size + size * tile.call / calls + part.start * tile.panel_step / calls);
+    let pitch = tile.panel_step.div_ceil(calls);
     if part.start == 0 {
         for row in tile.rows.clone() {
             simd.prefetch(block.result(row, 0));

@@ -11,7 +11,7 @@ use std::arch::is_aarch64_feature_detected;
 
 use super::instructions::{bfcvtn, bfdot, bfdot_lane, prefetch};
 use crate::simd::bits::{Bits, are_bits, cast, write};
-use crate::simd::{Kernel, Simd, forward, functions, token};
+use crate::simd::{HIGH_NIBBLES, Kernel, Simd, forward, functions, token};
 
 are_bits!(float32x4_t, int32x4_t, uint16x4_t, uint16x8_t);
 
@@ -144,6 +144,14 @@ functions! {
 
     fn high_halves(pairs: int32x4_t) -> float32x4_t {
         vreinterpretq_f32_s32(vandq_s32(pairs, vdupq_n_s32(0xffff_0000_u32 as i32)))
+    }
+
+    fn low_nibbles(words: int32x4_t) -> int32x4_t {
+        vreinterpretq_s32_s8(vshlq_n_s8::<4>(vreinterpretq_s8_s32(words)))
+    }
+
+    fn high_nibbles(words: int32x4_t) -> int32x4_t {
+        vandq_s32(words, vdupq_n_s32(HIGH_NIBBLES))
     }
 
     fn round_to_bf16(x: float32x4_t) -> float32x4_t {

@@ -11,7 +11,7 @@ use std::arch::x86_64::{
 
 use super::{NEAREST, prefetch};
 use crate::simd::bits::{read, write};
-use crate::simd::{Kernel, Simd, forward, functions, token};
+use crate::simd::{HIGH_NIBBLES, Kernel, Simd, forward, functions, token};
 
 /// A token of these vectors, with what it adds to AVX2 and FMA.
 macro_rules! avx2 {
@@ -93,6 +93,14 @@ functions! {
 
     fn high_halves(pairs: __m256i) -> __m256 {
         _mm256_castsi256_ps(_mm256_and_si256(pairs, _mm256_set1_epi32(0xffff_0000_u32 as i32)))
+    }
+
+    fn low_nibbles(words: __m256i) -> __m256i {
+        high_nibbles(_mm256_slli_epi32::<4>(words))
+    }
+
+    fn high_nibbles(words: __m256i) -> __m256i {
+        _mm256_and_si256(words, _mm256_set1_epi32(HIGH_NIBBLES))
     }
 
     fn round_to_bf16(x: __m256) -> __m256 {

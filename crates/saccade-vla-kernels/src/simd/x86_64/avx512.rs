@@ -12,7 +12,7 @@ use std::arch::x86_64::{
 
 use super::{NEAREST, avx2, prefetch};
 use crate::simd::bits::{cast, read, write};
-use crate::simd::{Kernel, MAX_LANES, Simd, forward, functions, token};
+use crate::simd::{HIGH_NIBBLES, Kernel, MAX_LANES, Simd, forward, functions, token};
 
 /// A token of these vectors, with what it adds to AVX-512 F, VL, BW and DQ.
 macro_rules! avx512 {
@@ -129,6 +129,14 @@ functions! {
 
     fn high_halves(pairs: __m512i) -> __m512 {
         _mm512_castsi512_ps(_mm512_and_si512(pairs, _mm512_set1_epi32(0xffff_0000_u32 as i32)))
+    }
+
+    fn low_nibbles(words: __m512i) -> __m512i {
+        high_nibbles(_mm512_slli_epi32::<4>(words))
+    }
+
+    fn high_nibbles(words: __m512i) -> __m512i {
+        _mm512_and_si512(words, _mm512_set1_epi32(HIGH_NIBBLES))
     }
 
     fn round_to_bf16(x: __m512) -> __m512 {

@@ -103,7 +103,7 @@ impl Tensor {
         Weight::Held(match weight_view(elements, in_features, out_features) {
             WeightRef::F32(view) => WeightRef::F32(view.transpose()),
             WeightRef::Bf16(view) => WeightRef::Bf16(view.transpose()),
-            WeightRef::Int8 { .. } => {
+            WeightRef::Int8 { .. } | WeightRef::Int4 { .. } => {
                 unreachable!("category-specific weights are checked to be floating point")
             }
         })
@@ -145,6 +145,9 @@ impl Weight<'_> {
                 values: values.columns(first..first + count),
                 scales,
             }),
+            Self::Held(WeightRef::Int4 { .. }) => {
+                unreachable!("category-specific weights are checked to be floating point")
+            }
             Self::Outline(outline) => Self::Outline(Outline {
                 in_features: count,
                 ..outline
@@ -154,9 +157,7 @@ impl Weight<'_> {
 
     pub(crate) fn in_features(&self) -> usize {
         match self {
-            Self::Held(WeightRef::F32(view)) => view.num_columns(),
-            Self::Held(WeightRef::Bf16(view)) => view.num_columns(),
-            Self::Held(WeightRef::Int8 { values, .. }) => values.num_columns(),
+            Self::Held(weight) => weight.shape().1,
             Self::Outline(outline) => outline.in_features,
         }
     }
@@ -169,6 +170,11 @@ pub(crate) fn weight_view(elements: &Elements, out_features: usize, in_features:
         Elements::Bf16(data) => WeightRef::Bf16(Matrix::new(data, in_features)),
         Elements::Int8 { values, scales } => WeightRef::Int8 {
             values: Matrix::new(values, in_features),
+            scales,
+        },
+        Elements::Int4 { values, scales } => WeightRef::Int4 {
+            values: Matrix::new(values, in_features.div_ceil(2)),
+            in_features,
             scales,
         },
     };

@@ -9,6 +9,7 @@ mod delta;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
+use saccade_vla_checkpoint::spec::SCALE_SUFFIX;
 use saccade_vla_checkpoint::{
     ADAPTER_CONFIG, ADAPTER_WEIGHTS, Checkpoint, Dtype, directory_of, plain_name, read_text, show_shape,
 };
@@ -90,12 +91,19 @@ fn own_config(adapter: &Path) -> Result<Option<String>> {
     }))
 }
 
+/// The type of a tensor that is int8, or int4, which its scales tell from other bytes.
+fn quantized_dtype(base: &Checkpoint, name: &str) -> Option<Dtype> {
+    let dtype = base.dtype(name).ok()?;
+    let is_int4 = || dtype == Dtype::U8 && base.dtype(&format!("{name}{SCALE_SUFFIX}")).is_ok();
+    (dtype == Dtype::I8 || is_int4()).then_some(dtype)
+}
+
 impl Adapter {
     /// Opens the adapter in `directory` for the checkpoint `base`.
     ///
     /// # Errors
     /// [`Error::File`] for files that are not there or broken; [`Error::Checkpoint`] for an adapter of another kind, for one that does not fit
-    /// the base, and for a base in int8.
+    /// the base, and for a base that is quantised.
     pub(crate) fn open(directory: &Path, base: &Checkpoint) -> Result<Self> {
         ensure!(
             directory.is_dir(), Input, "adapter";
@@ -103,13 +111,11 @@ impl Adapter {
         );
         let config = AdapterConfig::read(directory)?;
         let checkpoint = Checkpoint::open_file(&weights_of(directory)?)?;
-        if let Some(name) = base
-            .names()
-            .find(|name| matches!(base.dtype(name), Ok(Dtype::I8)))
-        {
+        let quantized = |name| Some((name, quantized_dtype(base, name)?));
+        if let Some((name, dtype)) = base.names().find_map(quantized) {
             bail!(
                 Checkpoint, "source";
-                "{name} is I8: expected weights that are not quantised; merge the adapter first, then quantise"
+                "{name} is {dtype:?}: expected weights that are not quantised; merge the adapter first, then quantise"
             );
         }
         let mut changes = BTreeMap::new();
