@@ -6,15 +6,16 @@ use super::step::Step;
 use crate::simd::Simd;
 use crate::simd::bits::cast;
 
-/// Steps over `k`: how many of them a word of weights holds and how many words of a row they are; what a
-/// vector of words of weights becomes for word number `part` of the row; and the operation that sums the
-/// products.
+/// Steps over `k`, and the elements whose loops make them: how many of them a word of weights holds and how many
+/// words of a row they are; what a vector of words of weights becomes for word number `part` of the row; and the
+/// operation that sums the products.
 macro_rules! steps {
-    ($($elements:ident: $depth:literal k in $words:literal words, $fewer:literal groups fewer,
+    ($($elements:ident as $loops:ident: $depth:literal k in $words:literal words, $fewer:literal groups fewer,
        |$simd:ident, $weights:ident, $part:ident| $factors:expr, |$x:ident, $w:ident, $sum:ident| $product:expr;)+) => {$(
         impl Step<Broadcast> for $elements {
             const DEPTH: usize = $depth;
             const FEWER_GROUPS: usize = $fewer;
+            type Loops = $loops;
 
             #[inline(always)]
             unsafe fn multiply_add<S: Simd, const NV: usize, const MR: usize>(
@@ -62,14 +63,14 @@ fn widened<S: Simd>(simd: S, pairs: S::I32, part: usize) -> S::F32 {
 // Widening takes a register. Shares of the FMA peak at 296 x 2048 x 1536 on Zen 4: 8 and 7 rows of AVX-512
 // 0.77 and 0.97, 6 and 5 rows of AVX2 0.70 and 0.88.
 steps! {
-    F32: 1 k in 1 words, 0 groups fewer,
+    F32 as F32: 1 k in 1 words, 0 groups fewer,
         |simd, weights, part| simd.bits_to_f32(weights), |x, w, sum| simd.fma(x, w, sum);
-    WidenedBf16: 2 k in 2 words, 1 groups fewer,
+    WidenedBf16 as WidenedBf16: 2 k in 2 words, 1 groups fewer,
         |simd, weights, part| widened(simd, weights, part), |x, w, sum| simd.fma(x, w, sum);
-    RoundedBf16: 2 k in 2 words, 1 groups fewer,
+    RoundedBf16 as WidenedBf16: 2 k in 2 words, 1 groups fewer,
         |simd, weights, part| widened(simd, weights, part), |x, w, sum| simd.fma(x, w, sum);
-    Bf16: 2 k in 1 words, 0 groups fewer,
+    Bf16 as Bf16: 2 k in 1 words, 0 groups fewer,
         |simd, weights, part| weights, |x, w, sum| simd.dot_bf16(sum, x, w);
-    Int8: 4 k in 1 words, 0 groups fewer,
+    Int8 as Int8: 4 k in 1 words, 0 groups fewer,
         |simd, weights, part| weights, |x, w, sum| simd.dot_int8(sum, x, w);
 }

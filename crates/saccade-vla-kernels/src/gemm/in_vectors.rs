@@ -4,6 +4,7 @@ use std::marker::PhantomData;
 use std::mem::MaybeUninit;
 
 use super::convert::Convert;
+use super::elements::Elements;
 use super::name::{Joined, join};
 use super::nibbles::{NAME_INT4, has_nibbles, packed_words};
 use super::outliers::MultiplyOutliers;
@@ -78,9 +79,13 @@ unsafe impl<S: Simd, E: RunsOn<S, L>, L: MicroKernel> Gemm for InVectors<S, E, L
     fn multiply(&self, block: &Block<'_>, sums: &mut [MaybeUninit<u32>]) {
         let row_words = E::converted_stride(block.in_features).unwrap_or(block.in_features);
         block.check(self.shape(), self.panel_words(block.in_features), row_words, sums);
-        // SAFETY: checked above, and `S` has the instructions because of `RunsOn`.
+        const {
+            assert!(E::DEPTH == E::Loops::DEPTH && E::FEWER_GROUPS == E::Loops::FEWER_GROUPS);
+            assert!(E::PER_WORD == E::Loops::PER_WORD && E::GROUP == E::Loops::GROUP);
+        }
+        // SAFETY: checked above, and `S` has the instructions because of `RunsOn`: the steps are the same.
         self.simd
-            .run(&mut unsafe { Multiply::<E, L>::new(block, self.has_nibbles, sums) });
+            .run(&mut unsafe { Multiply::<E::Loops, L>::new(block, self.has_nibbles, sums) });
     }
 
     fn multiply_outliers(&self, outliers: MultiplyOutliers<'_>) {

@@ -13,6 +13,8 @@ pub(crate) trait Step<L>: Elements {
     /// Groups of rows by which the largest tile of sums is smaller than it could be: a step takes registers,
     /// too.
     const FEWER_GROUPS: usize = 0;
+    /// Elements whose steps are the same, for the loops over them to be compiled once; or these themselves.
+    type Loops: Step<L, Loops = Self::Loops>;
 
     /// `sums += x W` over step number `step`, of which the first `count` of [`Self::DEPTH`] elements are
     /// there. `MR` counts groups of rows, `NV` vectors of sums.

@@ -191,10 +191,11 @@ unsafe fn by_matrix<S: Simd, E: ByMatrix, const NV: usize, const MR: usize>(
 
 /// Steps that one of these functions makes.
 macro_rules! steps {
-    ($($elements:ident by $step:ident of $instruction:ident, $depth:literal k, $fewer:literal groups fewer;)+) => {$(
+    ($($elements:ident as $loops:ident by $step:ident of $instruction:ident, $depth:literal k, $fewer:literal groups fewer;)+) => {$(
         impl Step<Lanes> for $elements {
             const DEPTH: usize = $depth;
             const FEWER_GROUPS: usize = $fewer;
+            type Loops = $loops;
 
             #[inline(always)]
             unsafe fn multiply_add<S: Simd, const NV: usize, const MR: usize>(
@@ -213,20 +214,21 @@ macro_rules! steps {
 }
 
 steps! {
-    F32 by by_lane of F32, 4 k, 0 groups fewer;
-    WidenedBf16 by by_lane of F32, 4 k, 0 groups fewer;
-    RoundedBf16 by by_lane of F32, 4 k, 0 groups fewer;
-    MatrixBf16 by by_matrix of MatrixBf16, 4 k, 3 groups fewer;
-    I8mmInt8 by by_matrix of I8mmInt8, 8 k, 3 groups fewer;
+    F32 as F32 by by_lane of F32, 4 k, 0 groups fewer;
+    WidenedBf16 as WidenedBf16 by by_lane of F32, 4 k, 0 groups fewer;
+    RoundedBf16 as WidenedBf16 by by_lane of F32, 4 k, 0 groups fewer;
+    MatrixBf16 as MatrixBf16 by by_matrix of MatrixBf16, 4 k, 3 groups fewer;
+    I8mmInt8 as I8mmInt8 by by_matrix of I8mmInt8, 8 k, 3 groups fewer;
     // With seven rows, as of float32, compilers spill: 82 instead of 92 % of the throughput that llvm-mca
     // predicts for the Cortex-A76.
-    DotprodInt8 by by_lane of DotprodInt8, 16 k, 1 groups fewer;
+    DotprodInt8 as DotprodInt8 by by_lane of DotprodInt8, 16 k, 1 groups fewer;
 }
 
 impl Step<Lanes> for WideningInt8 {
     const DEPTH: usize = 16;
     // Products and pairs of the row take registers.
     const FEWER_GROUPS: usize = 2;
+    type Loops = Self;
 
     #[inline(always)]
     unsafe fn multiply_add<S: Simd, const NV: usize, const MR: usize>(
