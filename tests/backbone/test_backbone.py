@@ -43,9 +43,12 @@ def test_masks_and_places_of_views(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", NAMES)
-@pytest.mark.parametrize(("precision", "bound"), [("bfloat16", 0.015), ("int8", 0.08), ("int4", 0.8)])
+@pytest.mark.parametrize(("precision", "bound"), [("bfloat16", 0.015), ("int8", 0.08), ("int4", 0.5)])
 def test_lower_precisions_are_close(name: str, precision: str, bound: float, isa: str) -> None:
-    """The released code's own bfloat16 runs are 0.9 % from float64 (n15_bf16)."""
+    """The released code's own bfloat16 runs are 0.9 % from float64 (n15_bf16).
+
+    int4 measured over all files and instruction sets: 0.32 in the median, at most 0.39.
+    """
     released = released_backbone(name)
     features = released.load(precision)(released.inputs()).backbone_features
     assert relative_error(np.asarray(features), released.features) < bound
@@ -230,6 +233,6 @@ def test_int8_bears_outliers(kind: str, isa: str) -> None:
         backbone = saccade.Backbone.from_tensors(tensors, config=released.about, precision=precision)
         return np.asarray(backbone(released.inputs()).backbone_features)
 
-    # Without outliers it is 0.03 to 0.06.
+    # Without outliers it is 0.03 to 0.06; in int4 at most 0.39, and 0.30 to 0.40 with them.
     assert relative_error(features("int8"), features("float32")) < 0.08
-    assert relative_error(features("int4"), features("float32")) < 0.8
+    assert relative_error(features("int4"), features("float32")) < 0.5

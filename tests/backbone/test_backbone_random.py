@@ -16,7 +16,8 @@ from saccade_lab.reference import Backbone
 from tests.helpers.reference_backbone_cases import config_of, random_inputs, random_sizes, randomised
 
 #: Root mean square of the error relative to that of the features; of few channels some are badly conditioned.
-TOLERANCE = {"float32": 5e-6, "bfloat16": 0.04, "int8": 0.12, "int4": 0.8}
+#: int4 measured over 24 seeds of each version: 0.29 in the median, at most 0.50.
+TOLERANCE = {"float32": 5e-6, "bfloat16": 0.04, "int8": 0.12, "int4": 0.6}
 
 
 def test_the_configs_are_those_of_the_sizes() -> None:

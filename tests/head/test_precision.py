@@ -108,13 +108,13 @@ def test_errors_are_those_of_the_rounding(
 MEASURED = {
     ("n15_tiny", "bfloat16"): 1.3e-2,
     ("n15_tiny", "int8"): 3.3e-2,
-    ("n15_tiny", "int4"): 0.5,
+    ("n15_tiny", "int4"): 0.18,
     ("n15_single_view", "bfloat16"): 1.4e-3,
     ("n15_single_view", "int8"): 4.3e-3,
-    ("n15_single_view", "int4"): 0.05,
+    ("n15_single_view", "int4"): 0.048,
     ("n15_bf16", "bfloat16"): 4.1e-4,
     ("n15_bf16", "int8"): 2.1e-3,
-    ("n15_bf16", "int4"): 0.05,
+    ("n15_bf16", "int4"): 0.028,
 }
 
 
@@ -174,7 +174,8 @@ def test_interventions_do_what_they_do_in_float64(isa: str, low: str, tmp_path: 
         with torch.no_grad():
             effect = (reference(**inputs, intervention=given) - reference(**inputs)).numpy()
         own = run(head, inputs, intervention=given).astype(np.float64) - run(head, inputs)
-        # What rounding makes of the two runs is not what the intervention does: both are there.
+        # What rounding makes of the two runs is not what the intervention does: both are there. Measured in
+        # int4: 0.30 to 0.60 with this seed; over 16 seeds 0.48 in the median and at most 0.85.
         assert rms(own - effect) < rms(effect) * (0.75 if low == "int4" else 0.5)
 
 
@@ -264,8 +265,8 @@ def test_cross_attention_alone(isa: str, precision: str) -> None:
     exact = saccade.CrossAttention(tensors, 4)
     expected = np.asarray(exact(states, exact.project(tokens)))
     # bfloat16 rounds by up to 2^-9 of a number, int8 by 1/254 of a row's range, int4 by 1/14 and less, each
-    # several times over.
-    bound = {"float32": 0.0, "bfloat16": 2.0**-6, "int8": 2.0**-4, "int4": 0.5}[precision]
+    # several times over. Measured in int4 over 20 seeds: 0.16 in the median, at most 0.28.
+    bound = {"float32": 0.0, "bfloat16": 2.0**-6, "int8": 2.0**-4, "int4": 0.35}[precision]
     assert np.abs(out - expected).max() <= bound * np.abs(expected).max()
     float32, low = exact.nbytes, attention.nbytes
     assert {
@@ -298,7 +299,8 @@ def test_weights_of_zeros_and_of_one_outlier(isa: str, precision: str) -> None:
     out = np.asarray(attention(np.ones((1, 2, 64), np.float32), attention.project(tokens)))
     # Values are to_v's bias for all keys.
     expected = tensors["to_out.0.weight"] @ tensors["to_v.bias"] + tensors["to_out.0.bias"]
-    tolerance = 0.1 if precision == "int4" else 2e-2
+    # Measured in int4 over 20 seeds: 0.025 in the median, at most 0.044.
+    tolerance = 0.06 if precision == "int4" else 2e-2
     np.testing.assert_allclose(out[0, 0], expected, rtol=tolerance, atol=tolerance)
     assert out[0, 0, 3] == pytest.approx(expected[3], rel=2e-2)  # the outlier itself is a whole step
 

@@ -114,7 +114,8 @@ def test_an_observation_has_the_same_bits_in_any_batch(kind: str, precision: str
         samples = head.sample(head.encode(features, **masks), **rest, noise=noise, num_samples=2)
         assert same(samples[:, 1], many[row : row + 1])
     with torch.no_grad():
-        assert relative_error(many, reference(**inputs)) <= (0.4 if precision == "int4" else 0.1)
+        # Measured in int4: 0.17 to 0.19 with these weights; over ten seeds 0.21 in the median, at most 0.76.
+        assert relative_error(many, reference(**inputs)) <= (0.3 if precision == "int4" else 0.1)
 
 
 @pytest.mark.parametrize("kind", ["n1.5", "n1.6"])

@@ -29,7 +29,7 @@ from saccade_lab.reference.random_weights import random_tensor
 #: from torch's float32 functions; where the original rounds to bfloat16, saccade does not.
 EXACT = 3e-4
 ROUNDED = 0.05
-INT4 = 0.5  # of parts as small as these
+INT4 = 0.4  # of parts as small as these: 0.10 to 0.30 measured over five seeds of weights and inputs
 
 
 @dataclass(frozen=True)

@@ -22,11 +22,12 @@ from saccade.integrations.weights import Watch
 Engine = TypeVar("Engine")
 
 #: Largest error in the check at load, relative to what the original computes. In exact arithmetic the tables
-#: of the released heads cause a difference of 2e-4. bfloat16 and int8 round to 8 bits, int4 to 4, which costs
-#: small parts most. Another architecture differs by about 1.
+#: of the released heads cause a difference of 2e-4. bfloat16 and int8 round to 8 bits. int4 rounds to 4,
+#: which costs small parts most: over five seeds of the tests' weights and inputs the check found 0.14 to
+#: 0.46, and of 72 random backbones 0.50 at most. Another architecture differs by about 1.
 EXACT_TOLERANCE = 1e-2
 ROUNDED_TOLERANCE = 0.3
-INT4_TOLERANCE = 0.7
+INT4_TOLERANCE = 0.6
 
 
 def tolerance_of(precision: str, rounded: bool) -> float:
