@@ -16,7 +16,7 @@ from safetensors.torch import load_file, save_file
 
 import saccade
 from saccade import cli
-from saccade.checkpoints import convert, verify
+from saccade.checkpoints import convert, quantize, verify
 from saccade.checkpoints.finite import count_not_finite
 from saccade.checkpoints.precisions import PRECISIONS
 from saccade.checkpoints.verification import TOLERANCE
@@ -53,6 +53,14 @@ def test_whole_checkpoints_of_every_layout_pass(layout: str) -> None:
     for run in found.runs[1:]:
         assert run.difference is not None
         assert 0 < run.difference.worst < 0.5
+
+
+def test_values_of_int4_are_counted_not_their_bytes(tmp_path: Path) -> None:
+    counts = {}
+    for to in ("int8", "int4"):
+        quantize(saccade.demo_checkpoint(), tmp_path / to, to=to)
+        counts[to] = {name: part.parameters for name, part in verify(tmp_path / to).tensors.items()}
+    assert counts["int4"] == counts["int8"]
 
 
 @pytest.mark.parametrize("version", ["n1.5", "n1.6", "n1.7"])

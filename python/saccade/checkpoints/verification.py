@@ -239,7 +239,8 @@ def _check_tensors(
             part = "neither"
         counts = found.tensors.setdefault(part, Tensors())
         counts.count += 1
-        counts.parameters += math.prod(tensor.shape)
+        values = 2 if tensor.dtype == "U8" else 1  # int4: two in a byte
+        counts.parameters += values * math.prod(tensor.shape)
         counts.nbytes += tensor.nbytes
         counts.dtypes[tensor.dtype] = counts.dtypes.get(tensor.dtype, 0) + 1
     return backbone_prefix is not None
