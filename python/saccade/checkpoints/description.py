@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
+import math
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -101,6 +102,16 @@ def description_of(published: _saccade.HeadCheckpoint, source: Source) -> Descri
         files=[File(str(file), file.stat().st_size) for file in published.files],
         tensors=[StoredTensor(*tensor) for tensor in published.tensors()],
     )
+
+
+def num_values(dtype: str, shape: Sequence[int]) -> int:
+    """The number of values of a stored tensor; a byte of int4, which is stored as U8, has two.
+
+    Example:
+        >>> num_values("U8", (3, 4)), num_values("I8", (3, 8))
+        (24, 24)
+    """
+    return math.prod(shape) * (2 if dtype == "U8" else 1)
 
 
 def read_tensors(source: Source, prefix: str = "") -> dict[str, Float32Array]:

@@ -5,7 +5,6 @@ One precision at a time is in memory.
 
 from __future__ import annotations
 
-import math
 import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -16,7 +15,7 @@ import saccade._saccade as _saccade
 from saccade._internal.arrays import integer
 from saccade._internal.hub import resolve
 from saccade._internal.hub_files import WEIGHTS
-from saccade.checkpoints.description import Description, Source, description_of, open_published
+from saccade.checkpoints.description import Description, Source, description_of, num_values, open_published
 from saccade.checkpoints.finite import count_not_finite
 from saccade.checkpoints.trial import Reference, Run, lines_of, run_head, run_policy
 from saccade.checkpoints.whole import RobotFindings, robots_of
@@ -239,8 +238,7 @@ def _check_tensors(
             part = "neither"
         counts = found.tensors.setdefault(part, Tensors())
         counts.count += 1
-        values = 2 if tensor.dtype == "U8" else 1  # int4: two in a byte
-        counts.parameters += values * math.prod(tensor.shape)
+        counts.parameters += num_values(tensor.dtype, tensor.shape)
         counts.nbytes += tensor.nbytes
         counts.dtypes[tensor.dtype] = counts.dtypes.get(tensor.dtype, 0) + 1
     return backbone_prefix is not None
