@@ -15,6 +15,7 @@ ROOT = Path(__file__).resolve().parents[1]
 MAKE = ROOT / ".venv"  # where the Makefile installs nox
 ENVIRONMENTS = ROOT / ".nox"
 PROGRAMS = "Scripts" if os.name == "nt" else "bin"
+PYTHON = "python.exe" if os.name == "nt" else "python"
 
 
 def digest(files: Iterable[Path]) -> str:
@@ -43,7 +44,7 @@ class Environment:
     def __init__(self, session: nox.Session, folder: Path) -> None:
         self.session = session
         self.folder = folder
-        self.python = folder / PROGRAMS / "python"
+        self.python = folder / PROGRAMS / PYTHON
         self.note = folder / "saccade-steps.json"
         # An environment that was copied or moved points to its old place.
         command = [str(self.python), "-c", "import sys; print(sys.prefix)"]

@@ -45,7 +45,8 @@ def lacks_rust():
     found = re.search(r"(\d+)\.(\d+)", said)
     if not found or tuple(map(int, found.groups())) < tuple(map(int, oldest.split(".")[:2])):
         return f"Rust {oldest} or newer is needed; found {said or 'a cargo that does not run'}.{how}"
-    if not shutil.which("cc"):
+    # On Windows Rust finds Visual Studio's linker by itself.
+    if sys.platform != "win32" and not shutil.which("cc"):
         return (
             "Rust needs a C compiler to link with; no cc was found on PATH."
             "\n    Debian, Ubuntu: apt-get install build-essential"

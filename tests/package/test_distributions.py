@@ -16,6 +16,8 @@ ROOT = Path(__file__).resolve().parents[2]
 VERSION = re.search(r'^version = "(.+)"', (ROOT / "Cargo.toml").read_text(), re.MULTILINE)[1]  # type: ignore[index]
 #: Folder -> the package in it, of the distributions that are pure Python.
 PURE = {"lab": "saccade_lab", "plugins/lerobot": "lerobot_policy_saccade"}
+#: What the extension is called in a wheel.
+EXTENSION = "_saccade.pyd" if sys.platform == "win32" else "_saccade.abi3.so"
 LICENCES = {"LICENSE-MIT", "LICENSE-APACHE"}
 
 
@@ -35,7 +37,7 @@ def names_in(archive: Path) -> set[str]:
 def files_of(package: Path) -> set[str]:
     """The files of a package, relative to its folder's parent."""
     files = (path for path in package.rglob("*") if path.is_file())
-    kept = (path for path in files if path.suffix not in (".pyc", ".so"))
+    kept = (path for path in files if path.suffix not in (".pyc", ".so", ".pyd"))
     return {path.relative_to(package.parent).as_posix() for path in kept}
 
 
@@ -55,7 +57,7 @@ def test_wheel_serves_every_python_and_holds_what_the_package_reads(wheel: Path)
         demo = [info for info in archive.infolist() if "/checkpoints/demo/" in info.filename]
     sources = files_of(ROOT / "python" / "saccade")
     folder = f"saccade_vla-{VERSION}.dist-info"
-    assert {name for name in names if not name.startswith(folder)} == sources | {"saccade/_saccade.abi3.so"}
+    assert {name for name in names if not name.startswith(folder)} == sources | {f"saccade/{EXTENSION}"}
     assert {f"saccade/checkpoints/demo/{name}" for name in ("config.json", "model.safetensors")} <= names
     assert sum(info.file_size for info in demo) < 10_000_000
     assert {f"{folder}/licenses/{name}" for name in LICENCES} <= names

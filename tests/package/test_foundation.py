@@ -14,6 +14,7 @@ from types import ModuleType
 import pytest
 
 import saccade
+from tests.helpers.systems import linux, posix
 
 ROOT = Path(__file__).resolve().parents[2]
 VERSION = re.search(r'^version = "(.+)"', (ROOT / "Cargo.toml").read_text(), re.MULTILINE)[1]  # type: ignore[index]
@@ -53,6 +54,7 @@ def test_import_loads_numpy_and_nothing_else() -> None:
     assert python(code) in ("saccade", "numpy saccade")
 
 
+@linux
 def test_import_starts_no_thread() -> None:
     code = (
         "import os, numpy; count = lambda: len(os.listdir('/proc/self/task'));"
@@ -100,6 +102,7 @@ def test_old_python_is_named(needs: ModuleType, monkeypatch: pytest.MonkeyPatch)
     assert "Python 4.0 or newer is needed" in needs.lacks_python()
 
 
+@posix
 def test_missing_or_old_rust_is_named(
     needs: ModuleType, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
@@ -111,6 +114,17 @@ def test_missing_or_old_rust_is_named(
     assert "found cargo 1.70.0" in needs.lacks_rust()
     cargo.write_text("#!/bin/sh\necho 'cargo 1.99.0'\n")
     assert "no cc was found" in needs.lacks_rust()
+
+
+@pytest.mark.parametrize(("platform", "missing"), [("linux", True), ("win32", False)])
+def test_rust_needs_a_cc_on_path_except_on_windows(
+    needs: ModuleType, monkeypatch: pytest.MonkeyPatch, platform: str, missing: bool
+) -> None:
+    said = subprocess.CompletedProcess(["cargo"], 0, stdout=b"cargo 1.999.0")
+    monkeypatch.setattr(needs.shutil, "which", lambda name: name if name == "cargo" else None)
+    monkeypatch.setattr(needs.subprocess, "run", lambda *words, **options: said)
+    monkeypatch.setattr(sys, "platform", platform)
+    assert (needs.lacks_rust() is not None) == missing
 
 
 def test_missing_opengl_names_the_packages(needs: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -133,6 +147,7 @@ def test_every_problem_is_printed(
     assert capsys.readouterr().err == "missing: this\nmissing: that\n"
 
 
+@posix
 @pytest.mark.parametrize(
     ("installed", "default", "built_with"),
     [
