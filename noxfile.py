@@ -354,6 +354,17 @@ def build_wheels(session: nox.Session, options: Iterable[str]) -> Environment:
     return environment
 
 
+@nox.session
+def metadata(session: nox.Session) -> None:
+    """Write source archives of the last commit, and check what an index will show: `twine check --strict`."""
+    needs(session, "python", "rust")
+    environment = Environment(session, ENVIRONMENTS / "metadata").install("metadata")
+    folder = ROOT / "out" / "metadata"
+    shutil.rmtree(folder, ignore_errors=True)
+    environment.run(".ci/wheels/sources.py", "--out", folder, "--no-build")
+    environment.run("-m", "twine", "check", "--strict", *sorted(folder.glob("*.tar.gz")))
+
+
 @nox.session(name="test-wheel")
 def test_wheel(session: nox.Session) -> None:
     """Build the wheels and test them on CPythons, NumPys and emulated CPUs; writes docs/results/wheels.md."""

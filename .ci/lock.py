@@ -39,6 +39,7 @@ FILES: dict[str, tuple[list[str], list[str]]] = {
     "docs": ([], ["docs"]),
     "workflows": ([], ["workflows"]),
     "audit": ([], ["audit"]),
+    "metadata": ([], ["metadata"]),
     "wheels": ([], ["wheels"]),
 }
 APART = ("dev", "wheels")

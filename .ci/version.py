@@ -3,15 +3,17 @@
     python .ci/version.py              prints it
     python .ci/version.py --check      fails if a file says another one
     python .ci/version.py --tag v0.2.0 the same, and the tag and the top of CHANGELOG.md must be of it
-    python .ci/version.py 0.2.0        writes it everywhere; then `cargo check` writes the Cargo.lock files
+    python .ci/version.py 0.2.0        writes it everywhere, and today in CITATION.cff as the day of release;
+                                       then `cargo check` writes the Cargo.lock files
 
-Package formats want a literal version in each file, so it cannot be read from one at build. Needs Python 3.10
-and nothing else.
+A version has three numbers, because Cargo and Python spell pre-releases differently. Package formats want a
+literal version in each file, so it cannot be read from one at build. Needs Python 3.10 and nothing else.
 """
 
 from __future__ import annotations
 
 import argparse
+import datetime
 import re
 import sys
 from pathlib import Path
@@ -27,7 +29,10 @@ REPEATED = (
     ("plugins/lerobot/pyproject.toml", r'(?m)^(version = ")([^"]+)(")'),
     ("CITATION.cff", r"(?m)^(version: )(\S+)()$"),
 )
-VERSION = re.compile(r"\d+\.\d+\.\d+(?:(?:a|b|rc)\d+)?")
+VERSION = re.compile(r"\d+\.\d+\.\d+")
+#: The file with the day of the release, and its line. Before the first release there is none.
+CITATION = "CITATION.cff"
+DAY = re.compile(r"(?m)^date-released: (\d{4}-\d{2}-\d{2})\n")
 
 
 def held(root: Path) -> str:
@@ -54,15 +59,23 @@ def problems_of_tag(root: Path, tag: str) -> list[str]:
     text = (root / "CHANGELOG.md").read_text(encoding="utf-8")
     (first, *_) = re.findall(r"(?m)^## (\S+)", text)
     found = [] if tag == f"v{version}" else [f"tag {tag}, expected v{version}"]
-    return found + ([] if first == version else [f"CHANGELOG.md begins with {first}, expected {version}"])
+    if first != version:
+        found.append(f"CHANGELOG.md begins with {first}, expected {version}")
+    if not DAY.search((root / CITATION).read_text(encoding="utf-8")):
+        found.append(f"{CITATION} has no date-released: python .ci/version.py {version} writes it")
+    return found
 
 
-def write(root: Path, version: str) -> None:
-    """Writes a version into every file of `root` that has it."""
+def write(root: Path, version: str, day: datetime.date) -> None:
+    """Writes a version and the day of its release into every file of `root` that has it."""
     for file, pattern in (HELD, *REPEATED):
         path = root / file
         text = re.sub(pattern, rf"\g<1>{version}\g<3>", path.read_text(encoding="utf-8"))
         path.write_text(text, encoding="utf-8")
+    path = root / CITATION
+    text = DAY.sub("", path.read_text(encoding="utf-8"))
+    dated = f"version: {version}\ndate-released: {day.isoformat()}\n"
+    path.write_text(text.replace(f"version: {version}\n", dated), encoding="utf-8")
 
 
 def main() -> int:
@@ -78,8 +91,8 @@ def main() -> int:
         if args.check or args.tag:
             parser.error("--check and --tag write nothing: give them without a version")
         if not VERSION.fullmatch(args.version):
-            parser.error(f"expected a version such as 0.2.0 or 0.2.0rc1, got {args.version!r}")
-        write(ROOT, args.version)
+            parser.error(f"expected a version such as 0.2.0, got {args.version!r}")
+        write(ROOT, args.version, datetime.date.today())
     elif args.check or args.tag:
         found = problems(ROOT) + (problems_of_tag(ROOT, args.tag) if args.tag else [])
         for line in found:

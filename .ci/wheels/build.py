@@ -22,6 +22,11 @@ import tarfile
 import tempfile
 from pathlib import Path
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+import published
+import version
+from links import absolute
+
 ROOT = Path(__file__).resolve().parent.parent.parent
 #: Without the default features of the binding, which only tests need.
 BUILD = "-m maturin build --release --locked --quiet --no-default-features"
@@ -53,12 +58,17 @@ def git(*args: str) -> str:
 
 
 def unpack(commit: str, folder: Path) -> None:
-    """Unpacks the files of a commit into an empty `folder`."""
+    """Unpacks the files of a commit into an empty `folder`; READMEs get links that lead out of it."""
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
     archive = subprocess.run(["git", "archive", commit], cwd=ROOT, check=True, stdout=subprocess.PIPE).stdout
     with tarfile.open(fileobj=io.BytesIO(archive)) as opened:  # tar is another program on each system
         opened.extractall(folder, filter="data")
+    for name in ("", *PURE):
+        readme = folder / name / "README.md"
+        text = readme.read_text(encoding="utf-8")
+        tag, place = f"v{version.held(folder)}", name.removeprefix("./")
+        readme.write_bytes(absolute(text, place, published.held(folder), tag).encode())
 
 
 def has_standard_library(target: str) -> bool:

@@ -2,8 +2,9 @@
 
     python check.py OUT.npz
 
-Stops with an error at the first failure. Writes the actions of the bundled policy's head in each precision
-to OUT.npz, and prints one line of JSON. Starts no other process, so that it can run under an emulator.
+Stops with an error at the first failure. The bundled policy acts from images and an instruction, and its head
+in each precision on fixed inputs; these actions are written to OUT.npz. Prints one line of JSON. Starts no
+other process, so that it can run under an emulator.
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ from saccade.checkpoints import convert, resize
 
 PACKAGE = Path(saccade.__file__).parent
 DEMO = saccade.demo_checkpoint()
+PRECISIONS = ("float32", "bfloat16", "int8", "int4")
 RANDOM = random.Random(6)  # the same numbers under every NumPy
 
 
@@ -87,6 +89,21 @@ def sample(source: Path, precision: str) -> npt.NDArray[np.float32]:
     return actions
 
 
+def check_policy() -> None:
+    """The bundled policy acts from images and an instruction, repeatably, and heeds the instruction."""
+    policy = saccade.Policy.from_pretrained(DEMO)
+    observation = policy.example_observation(seed=0)
+    actions = policy.act(observation, seed=0)
+    assert set(actions) == {"hand", "gripper"}, actions
+    for name, chunk in actions.items():
+        assert chunk.shape[:2] == (1, policy.head.config.action_horizon), chunk.shape
+        assert np.isfinite(chunk).all()
+        assert np.array_equal(policy.act(observation, seed=0)[name], chunk)
+    (key,) = observation["language"]
+    other = {**observation, "language": {key: [["open the drawer"]]}}
+    assert not np.array_equal(policy.act(other, seed=0)["hand"], actions["hand"])
+
+
 def check_files(actions: npt.NDArray[np.float32]) -> None:
     """Conversion to shards keeps the bits; more future tokens keep the actions."""
     with tempfile.TemporaryDirectory() as folder:
@@ -115,6 +132,11 @@ def check_commands() -> list[str]:
     assert status == 0
     assert all(name in text for name in cli.COMMANDS)
     works = []
+    for name, expected in {"demo": "hand x", "info": saccade.__version__}.items():
+        status, text, errors = run(name)
+        assert status == 0, f"{name}: {errors}"
+        assert expected in text, f"{name}: {text}"
+        works.append(name)
     for name in cli.COMMANDS:
         status, text, errors = run(name, "--help")
         assert status == 0, f"{name} --help: {errors}"
@@ -149,7 +171,8 @@ def main() -> None:
     """Runs all checks."""
     check_import()
     error = check_cross_attention()
-    actions = {precision: sample(DEMO, precision) for precision in ("float32", "bfloat16", "int8")}
+    actions = {precision: sample(DEMO, precision) for precision in PRECISIONS}
+    check_policy()
     check_files(actions["float32"])
     check_torch_is_named()
     works = check_commands()

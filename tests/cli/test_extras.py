@@ -140,6 +140,27 @@ def test_without_a_checkout_packages_and_versions_are_named(
     assert command.endswith(f"pip install {expected}")
 
 
+@pytest.mark.parametrize(
+    ("noted", "expected"),
+    [
+        ('{"dir_info": {}, "url": "file:///somewhere"}', r"'\./lab\[sim\]' \(in a clone of saccade\)"),
+        (None, r"'saccade-vla-lab\[sim\]==\d+\.\d+\.\d+'"),
+    ],
+)
+def test_the_lab_comes_from_where_saccade_came_from(
+    noted: str | None, expected: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(extras, "__file__", str(tmp_path / "lib" / "saccade" / "_internal" / "extras.py"))
+
+    class Installed:
+        def read_text(self, name: str) -> str | None:
+            assert name == "direct_url.json"
+            return noted
+
+    monkeypatch.setattr(importlib.metadata, "distribution", lambda name: Installed())
+    assert re.search(f"pip install {expected}$", extras.install_lab("sim"))
+
+
 def test_packages_go_to_the_environment_that_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = tmp_path / "bin"
     folder.mkdir()

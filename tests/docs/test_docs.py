@@ -37,8 +37,8 @@ PAGES = [
     ROOT / "plugins" / "lerobot" / "README.md",
     *sorted((ROOT / "docs").rglob("*.md")),
 ]
-#: These pages need checkpoints: `test_docs_checkpoints` runs them.
-NEED_CHECKPOINTS = tuple(f"{name}.md" for name in WITH_CHECKPOINTS)
+#: These pages need checkpoints or a server: `test_docs_checkpoints` and `test_tutorial` run them.
+NEED_MORE = (*(f"{name}.md" for name in WITH_CHECKPOINTS), "tutorial.md")
 MODULES = sorted(
     info.name
     for info in pkgutil.walk_packages(saccade.__path__, "saccade.")
@@ -89,7 +89,7 @@ def test_rows_of_a_table_have_as_many_cells_as_its_head(page: Path) -> None:
         assert len(set(bars.values())) == 1, bars
 
 
-@pytest.mark.parametrize("page", [page for page in PAGES if page.name not in NEED_CHECKPOINTS], ids=page_id)
+@pytest.mark.parametrize("page", [page for page in PAGES if page.name not in NEED_MORE], ids=page_id)
 def test_python_on_pages_runs(page: Path, tmp_path: Path) -> None:
     blocks = code_blocks(page, "python")
     if blocks:  # one program from top to bottom, as a reader would paste it

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import datetime
 import importlib.util
 import shutil
 import subprocess
@@ -46,13 +47,21 @@ def test_every_file_says_the_version_of_the_package() -> None:
 
 def test_a_new_version_is_written_everywhere(program: ModuleType, tree: Path) -> None:
     old = program.held(tree)
-    program.write(tree, "98.7.6")
+    program.write(tree, "98.7.6", datetime.date(2027, 1, 2))
     assert program.held(tree) == "98.7.6"
     assert program.problems(tree) == []
     for name in FILES[:-1]:
         text = (tree / name).read_text()
         assert "98.7.6" in text, name
         assert f'"{old}"' not in text, name
+
+
+def test_the_day_of_a_release_is_written_once_beside_its_version(program: ModuleType, tree: Path) -> None:
+    citation = tree / "CITATION.cff"
+    for version, day in (("98.7.6", datetime.date(2027, 1, 2)), ("98.7.7", datetime.date(2027, 3, 4))):
+        program.write(tree, version, day)
+        assert f"\nversion: {version}\ndate-released: {day.isoformat()}\n" in citation.read_text()
+    assert citation.read_text().count("date-released") == 1
 
 
 @pytest.mark.parametrize("name", FILES[:-1])
@@ -67,6 +76,8 @@ def test_a_file_with_another_version_is_named(program: ModuleType, tree: Path, n
 
 def test_a_tag_is_of_the_version_and_the_changelog_begins_with_it(program: ModuleType, tree: Path) -> None:
     version = program.held(tree)
+    program.write(tree, version, datetime.date(2027, 1, 2))
+    assert program.problems_of_tag(tree, f"v{version}") == []
     assert program.problems_of_tag(tree, "v98.7.6") == [f"tag v98.7.6, expected v{version}"]
     changelog = tree / "CHANGELOG.md"
     changelog.write_text("# Changelog\n\n## Unreleased\n\n" + changelog.read_text())
@@ -75,7 +86,14 @@ def test_a_tag_is_of_the_version_and_the_changelog_begins_with_it(program: Modul
     ]
 
 
-@pytest.mark.parametrize("words", [["1.2"], ["v1.2.3"], ["1.2.3", "--check"]])
+def test_a_release_has_a_day(program: ModuleType, tree: Path) -> None:
+    version, citation = program.held(tree), tree / "CITATION.cff"
+    citation.write_text(program.DAY.sub("", citation.read_text()))
+    (problem,) = program.problems_of_tag(tree, f"v{version}")
+    assert problem.startswith("CITATION.cff has no date-released")
+
+
+@pytest.mark.parametrize("words", [["1.2"], ["v1.2.3"], ["1.2.3rc1"], ["1.2.3-rc.1"], ["1.2.3", "--check"]])
 def test_nonsense_is_refused(words: list[str]) -> None:
     done = subprocess.run([sys.executable, SCRIPT, *words], capture_output=True, text=True, check=False)
     assert done.returncode == 2

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.metadata
 import importlib.util
 import os
 import shlex
@@ -125,9 +126,23 @@ def pip_install(*arguments: str) -> str:
 
 
 def install_lab(extra: str) -> str:
-    """How to install saccade-vla-lab, which is on no package index, with an extra."""
-    command = _install("lab", extra)
-    return command or f"{pip_install(f'./lab[{extra}]')} (in a clone of saccade)"
+    """How to install saccade-vla-lab with an extra: from where saccade itself was installed."""
+    if (command := _install("lab", extra)) is not None:
+        return command
+    if _is_from_an_index():
+        return pip_install(f"saccade-vla-lab[{extra}]=={importlib.metadata.version('saccade-vla')}")
+    return f"{pip_install(f'./lab[{extra}]')} (in a clone of saccade)"
+
+
+def _is_from_an_index() -> bool:
+    """Whether saccade-vla was installed by its name, and not from a folder, a file or a repository.
+
+    Installers note the address of everything else beside the package's metadata (PEP 610).
+    """
+    try:
+        return importlib.metadata.distribution("saccade-vla").read_text("direct_url.json") is None
+    except importlib.metadata.PackageNotFoundError:  # a folder on the path of modules
+        return False
 
 
 def _install(folder: str, extras: str) -> str | None:
