@@ -1,7 +1,11 @@
-"""Checks a built site: its links, its pictures, and that no page asks another machine for anything."""
+"""Checks a built site: its links, its pictures, and that no page or style asks another machine for anything.
+
+What a script would ask for when it runs is not found here.
+"""
 
 from __future__ import annotations
 
+import re
 import sys
 from collections.abc import Sequence
 from html.parser import HTMLParser
@@ -9,7 +13,21 @@ from pathlib import Path
 from urllib.parse import unquote, urlsplit
 
 #: Attributes that make a browser request something when it shows the page.
-LOADED = {"img": "src", "script": "src", "iframe": "src", "source": "src", "video": "src", "audio": "src"}
+LOADED = {
+    **dict.fromkeys(("img", "script", "iframe", "source", "video", "audio", "embed", "input"), ("src",)),
+    **dict.fromkeys(("use", "image"), ("href", "xlink:href")),
+    "object": ("data",),
+}
+#: What a style loads, in quotes or without: fonts, pictures, other styles.
+OF_STYLE = re.compile(
+    r"""url\(\s*(?:"([^"]*)"|'([^']*)'|([^\s)"']*))\s*\)|@import\s+(?:"([^"]*)"|'([^']*)')"""
+)
+COMMENT = re.compile(r"/\*.*?\*/", re.DOTALL)
+
+
+def of_style(text: str) -> list[str]:
+    """The addresses that a style sheet, or the style of an element, loads."""
+    return ["".join(parts) for parts in OF_STYLE.findall(COMMENT.sub("", text))]
 
 
 class Page(HTMLParser):
@@ -26,6 +44,7 @@ class Page(HTMLParser):
         self.ids: set[str] = set()
         self.links: list[str] = []
         self.loaded: list[str] = []
+        self._in_style = False
         self.feed(path.read_text(encoding="utf-8"))
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
@@ -36,8 +55,20 @@ class Page(HTMLParser):
             self.links.append(values["href"])
         if tag == "link" and "href" in values and values.get("rel") not in ("canonical", "author"):
             self.loaded.append(values["href"])
-        if tag in LOADED and LOADED[tag] in values:
-            self.loaded.append(values[LOADED[tag]])
+        self.loaded += [values[name] for name in LOADED.get(tag, ()) if name in values]
+        if tag in ("img", "source") and "srcset" in values:
+            self.loaded += [part.split()[0] for part in values["srcset"].split(",") if part.strip()]
+        self.loaded += of_style(values.get("style", ""))
+        self._in_style = tag == "style"
+
+    def handle_endtag(self, tag: str) -> None:
+        """Notes the end of a style."""
+        self._in_style = False
+
+    def handle_data(self, data: str) -> None:
+        """Notes what a style loads."""
+        if self._in_style:
+            self.loaded += of_style(data)
 
 
 def problems(html: Path) -> list[str]:
@@ -48,12 +79,14 @@ def problems(html: Path) -> list[str]:
     """
     pages = {path.resolve(): Page(path) for path in sorted(html.rglob("*.html"))}
     found = [] if pages else [f"{html}: no page"]
-    for path, page in pages.items():
+    styles = {path.resolve(): of_style(path.read_text(encoding="utf-8")) for path in html.rglob("*.css")}
+    loads = {path: page.loaded for path, page in pages.items()} | styles
+    for path, loaded in loads.items():
         name = path.relative_to(html.resolve()).as_posix()
-        for url in page.loaded:
+        for url in loaded:
             if urlsplit(url).netloc or urlsplit(url).scheme in ("http", "https"):
                 found.append(f"{name}: loads {url} from another machine")
-        for url in [*page.links, *page.loaded]:
+        for url in [*(pages[path].links if path in pages else ()), *loaded]:
             parts = urlsplit(url)
             if parts.scheme or parts.netloc:
                 continue

@@ -16,7 +16,7 @@ FONT = Path(str(find_spec("ziamath").origin)).parent / "fonts" / "STIXTwoMath-Re
 
 project = "saccade"
 author = "The saccade developers"
-project_copyright = "2026, the saccade authors; MIT or Apache-2.0"
+project_copyright = "2026, the saccade developers; MIT or Apache-2.0"
 version = release = saccade.__version__
 root_doc = "index"
 
@@ -63,7 +63,11 @@ pygments_style = "friendly"
 pygments_dark_style = "github-dark"
 highlight_language = "text"
 
-intersphinx_mapping = {"python": ("https://docs.python.org/3", str(SITE / "inventories" / "python.inv"))}
+# Python's is the published one; NumPy's has the types that signatures of saccade name.
+intersphinx_mapping = {
+    "python": ("https://docs.python.org/3", str(SITE / "inventories" / "python.inv")),
+    "numpy": ("https://numpy.org/doc/stable", str(SITE / "inventories" / "numpy.inv")),
+}
 
 
 def literal_types(app: Sphinx, what: str, name: str, of: object, options: object, lines: list[str]) -> None:

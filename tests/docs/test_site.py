@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import re
 from pathlib import Path
 from types import ModuleType
 
@@ -68,6 +69,21 @@ def test_help_of_commands_is_what_they_print(load: object) -> None:
     assert "examples:" in pages.help_of("act")
 
 
+def test_types_of_numpy_have_a_place_in_its_documentation() -> None:
+    lines = (SITE / "inventories" / "numpy.inv").read_text().splitlines()
+    assert lines[0] == "# Sphinx inventory version 1"
+    places = {name: place for name, kind, place in (line.split() for line in lines[3:])}
+    for name, place in places.items():
+        module, _, attribute = name.rpartition(".")
+        assert hasattr(importlib.import_module(module), attribute), name
+        assert place.startswith("reference/")
+        assert place.endswith(".html")
+    folders = ("python/saccade", "lab/saccade_lab")
+    files = (path for folder in folders for path in (ROOT / folder).rglob("*.py"))
+    used = set(re.findall(r"\bnpt?\.(?:random\.)?(\w+)", "\n".join(path.read_text() for path in files)))
+    assert {name.rpartition(".")[2] for name in places} - {"bool"} <= used
+
+
 @pytest.mark.parametrize(
     ("body", "problem"),
     [
@@ -84,6 +100,13 @@ def test_help_of_commands_is_what_they_print(load: object) -> None:
             '<link rel="stylesheet" href="//example.org/x.css">',
             "a.html: loads //example.org/x.css from another machine",
         ),
+        (
+            "<style>p { background: url('https://example.org/x.png') }</style>",
+            "a.html: loads https://example.org/x.png from another machine",
+        ),
+        ('<p style="background: url(x.png)">b</p>', "a.html: x.png leads nowhere"),
+        ('<img src="b.html" srcset="c.png 2x">', "a.html: c.png leads nowhere"),
+        ("<p>url(https://example.org/x.png)</p>", None),
     ],
 )
 def test_what_leads_nowhere_or_asks_another_machine_is_found(
@@ -91,6 +114,32 @@ def test_what_leads_nowhere_or_asks_another_machine_is_found(
 ) -> None:
     (tmp_path / "a.html").write_text(f"<html><body>{body}</body></html>")
     (tmp_path / "b.html").write_text('<html><body><p id="there">x</p></body></html>')
+    check = module("check_site", load)
+    assert check.problems(tmp_path) == ([] if problem is None else [problem])
+
+
+@pytest.mark.parametrize(
+    ("style", "problem"),
+    [
+        ("@font-face { src: url(font.ttf) format('truetype') }", None),
+        ('p { background: url("data:image/png;base64,AAAA") }', None),
+        ("/* url(gone.png) */", None),
+        ("p { background: url( 'gone.png' ) }", "styles/site.css: gone.png leads nowhere"),
+        (
+            "@font-face { src: url(https://example.org/f.ttf) }",
+            "styles/site.css: loads https://example.org/f.ttf from another machine",
+        ),
+        (
+            '@import "https://example.org/x.css";',
+            "styles/site.css: loads https://example.org/x.css from another machine",
+        ),
+    ],
+)
+def test_what_a_style_loads_is_found(load: object, tmp_path: Path, style: str, problem: str | None) -> None:
+    (tmp_path / "a.html").write_text("<p>x</p>")
+    (tmp_path / "styles").mkdir()
+    (tmp_path / "styles" / "font.ttf").touch()
+    (tmp_path / "styles" / "site.css").write_text(style)
     check = module("check_site", load)
     assert check.problems(tmp_path) == ([] if problem is None else [problem])
 
