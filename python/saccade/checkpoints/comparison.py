@@ -84,6 +84,14 @@ def action_changes(
     Raises:
         FileNotFoundError, CheckpointError: As :meth:`saccade.ActionHead.from_pretrained`.
         InputError, ShapeError: An option is out of range, or the recorded observations do not fit the head.
+
+    Example:
+        >>> import saccade
+        >>> demo = saccade.demo_checkpoint()
+        >>> report = saccade.resize(demo, "twice-the-tokens", num_future_tokens=64)
+        >>> found = action_changes(demo, "twice-the-tokens", num_vl_tokens=57)
+        >>> found.in_saccade.mean < 1e-5 < found.of_other_noise.mean
+        True
     """
     rng = np.random.default_rng(integer("seed", seed, least=0))
     arrays = None if features is None else read_arrays(Path(features))

@@ -77,6 +77,12 @@ def describe(source: Source, config: Config = None) -> Description:
     Raises:
         FileNotFoundError, CheckpointError: As :meth:`saccade.ActionHead.from_pretrained`, except that tensors
             need not fit the config.
+
+    Example:
+        >>> import saccade
+        >>> found = describe(saccade.demo_checkpoint())
+        >>> found.layout, found.version, found.config.num_layers
+        ('nvidia', 'n1.5', 4)
     """
     return description_of(open_published(source, config), source)
 
@@ -129,5 +135,11 @@ def read_tensors(source: Source, prefix: str = "") -> dict[str, Float32Array]:
         FileNotFoundError: ``source`` does not exist.
         CheckpointError: A file is damaged, or a tensor is not F32, BF16, F16, or I8 or U8 with
             scales.
+
+    Example:
+        >>> import saccade
+        >>> tensors = read_tensors(saccade.demo_checkpoint(), "action_head.future_tokens.")
+        >>> {name: tensor.shape for name, tensor in tensors.items()}
+        {'weight': (32, 128)}
     """
     return _saccade.read_tensors(os.fspath(resolve(source, files=WEIGHTS)), prefix)

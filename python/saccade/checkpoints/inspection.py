@@ -50,6 +50,14 @@ def inspect(
         FileNotFoundError, CheckpointError: As :meth:`saccade.ActionHead.from_pretrained`, except that values
             need not be finite.
         InputError: ``reference`` is of another version.
+
+    Example:
+        >>> import saccade
+        >>> found = saccade.inspect(saccade.demo_checkpoint())
+        >>> found.layout, found.version, found.parameters
+        ('nvidia', 'n1.5', 1310980)
+        >>> [robot.embodiment for robot in found.robots]
+        ['metaworld_sawyer']
     """
     published = open_published(source, config)
     published.check()

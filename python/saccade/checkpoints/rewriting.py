@@ -160,6 +160,15 @@ def quantize(
             or infinity. Or ``out`` cannot be written.
         InputError: ``to`` is another precision, ``out`` exists and ``force`` is not set, or it contains other
             files or the source.
+
+    Example:
+        >>> import saccade
+        >>> report = saccade.quantize(saccade.demo_checkpoint(), "policy-int8")
+        >>> report.head_bytes_after < report.head_bytes_before
+        True
+        >>> policy = saccade.Policy.from_pretrained("policy-int8", precision="int8")
+        >>> policy.act(policy.example_observation(), seed=0)["hand"].shape
+        (1, 16, 3)
     """
     rewrite = _rewrite(source, out, config, force=force, progress=progress, head_only=head_only)
     rewrite["keep_backbone"] = keep_backbone
@@ -212,6 +221,12 @@ def convert(
             another type of PEFT), a tensor of it does not fit the source, or the source is quantised.
         InputError: An option is out of range, ``out`` exists and ``force`` is not set, or ``out`` contains
             other files or the source.
+
+    Example:
+        >>> import saccade
+        >>> report = saccade.convert(saccade.demo_checkpoint(), "float32", dtype="float32")
+        >>> report.largest_error, report.bytes_after == 2 * report.bytes_before
+        (0.0, True)
     """
     folder = None if adapter is None else resolve(adapter)
     rewrite = _rewrite(
@@ -265,6 +280,16 @@ def resize(
             tokens, or has none. Or ``out`` cannot be written.
         InputError: An option is out of range, ``out`` exists and ``force`` is not set, or ``out`` contains
             other files or the source.
+
+    Example:
+        >>> import saccade
+        >>> saccade.ActionHead.from_pretrained(saccade.demo_checkpoint()).config.num_future_tokens
+        32
+        >>> report = saccade.resize(saccade.demo_checkpoint(), "more-tokens", num_future_tokens=64)
+        >>> report.sources[0], report.sources[32]  # the tokens of the source that these were made from
+        ((0,), (0,))
+        >>> saccade.ActionHead.from_pretrained("more-tokens").config.num_future_tokens
+        64
     """
     count = integer("num_future_tokens", num_future_tokens, least=0)
     drawn = integer("seed", seed, least=0)

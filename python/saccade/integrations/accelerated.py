@@ -73,6 +73,15 @@ def accelerate(
             compiled, quantised, hooked, replaced or accelerated already, or the original gives other results.
         DtypeError: The call is made under the default device ``meta``.
         CheckpointError: The weights are not those of a GR00T policy. The message lists every problem.
+
+    Example:
+        >>> import saccade
+        >>> def first_action(policy, batch: dict):
+        ...     "Of a `GrootPolicy` that lerobot has loaded, computed in bfloat16 by saccade."
+        ...     handle = saccade.accelerate(policy.eval(), precision="bfloat16")
+        ...     action = policy.select_action(batch)
+        ...     handle.restore()
+        ...     return action
     """
     precisions = precisions_of_parts(precision)
     module = modules.find(policy, heads.is_wanted, heads.WANTED)

@@ -32,6 +32,14 @@ def read_server_keys(secret_key: str | Path, client_keys: str | Path | None = No
 
     Raises:
         InputError: A file is missing or is not a key file, or the folder contains none.
+
+    Example:
+        >>> import zmq.auth
+        >>> from saccade.serve import read_server_keys
+        >>> public, secret = zmq.auth.create_certificates(".", "server")
+        >>> keys = read_server_keys(secret)
+        >>> keys.clients is None  # any client that knows the public key may connect
+        True
     """
     _, secret = read_pair(secret_key)
     if client_keys is None:

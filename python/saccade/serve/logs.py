@@ -118,6 +118,11 @@ def open_log(format: str = "text") -> Log:
 
     Raises:
         InputError: ``format`` is neither.
+
+    Example:
+        >>> from saccade.serve import open_log
+        >>> log = open_log("text")
+        >>> log.close()
     """
     if format not in ("text", "json"):
         raise InputError(f"format: expected text or json, got {format!r}")

@@ -327,6 +327,13 @@ def bind(host: str, port: int) -> socket.socket:
 
     Raises:
         OSError: It cannot be taken; names it.
+
+    Example:
+        >>> from saccade.serve import bind
+        >>> with bind("127.0.0.1", 0) as listener:
+        ...     address, port = listener.getsockname()
+        >>> address, port > 0
+        ('127.0.0.1', True)
     """
     name = None if host == "*" else host
     try:
