@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import doctest
 import importlib
+import inspect
 import os
 import pkgutil
 import re
@@ -75,10 +76,35 @@ def test_examples_in_docstrings(name: str, monkeypatch: pytest.MonkeyPatch, tmp_
     assert result.failed == 0
 
 
-def test_the_public_classes_have_examples() -> None:
+#: Packages with public names.
+PUBLIC = (
+    *("saccade", "saccade.checkpoints", "saccade.datasets", "saccade.diagnosis", "saccade.evaluation"),
+    *("saccade.integrations", "saccade.linalg", "saccade.serve", "saccade.torch"),
+)
+#: Classes that a program makes or loads. The others are results, and errors.
+MADE = ["ActionHead", "Backbone", "BackboneInputs", "Chunking", "Client", "CrossAttention", "Dataset"]
+MADE += [
+    "Intervention",
+    "Normalizer",
+    "PCA",
+    "Policy",
+    "Processor",
+    "Ridge",
+    "Server",
+    "Standardizer",
+    "Writer",
+]
+
+
+@pytest.mark.parametrize("package", PUBLIC)
+def test_public_functions_and_what_programs_make_have_examples(package: str) -> None:
+    module = importlib.import_module(package)
     finder = doctest.DocTestFinder()
-    for public in (saccade.ActionHead, saccade.CrossAttention, saccade.show_config):
-        assert any(test.examples for test in finder.find(public)), f"{public} has no example"
+    public = {name: getattr(module, name) for name in module.__all__}
+    wanted = {name: one for name, one in public.items() if inspect.isfunction(one) or name in MADE}
+    assert wanted
+    without = [name for name, one in wanted.items() if not any(found.examples for found in finder.find(one))]
+    assert without == []
 
 
 @pytest.mark.parametrize("page", PAGES, ids=page_id)
@@ -205,6 +231,18 @@ def test_every_image_of_the_docs_is_shown() -> None:
     text = "".join(page.read_text() for page in PAGES)
     images = [path for path in (ROOT / "docs").rglob("*") if path.suffix in (".png", ".gif")]
     assert [path.name for path in images if path.name not in text] == []
+
+
+def test_messages_that_the_page_of_errors_quotes_are_in_the_code() -> None:
+    table = (ROOT / "docs" / "errors.md").read_text().partition("| the message contains |")[2]
+    quoted = re.findall(r"^\| `(.*?)` \|", table, re.MULTILINE)
+    assert len(quoted) == len(re.findall(r"^\| [^-]", table, re.MULTILINE)) > 10
+    folders = ("python/saccade", "lab/saccade_lab", "crates")
+    files = (
+        path for folder in folders for path in (ROOT / folder).rglob("*") if path.suffix in (".py", ".rs")
+    )
+    code = "\n".join(path.read_text() for path in files)
+    assert [part for part in quoted if part not in code] == []
 
 
 def test_every_page_that_names_a_published_checkpoint_says_that_none_was_run() -> None:
