@@ -84,11 +84,11 @@ def write(root: Path, address: str) -> None:
     for name in ADDRESSED:
         path = root / name
         text = path.read_text(encoding="utf-8").replace(old, address)
-        path.write_text(text.replace(site_of(old), site_of(address)), encoding="utf-8")
+        path.write_text(text.replace(site_of(old), site_of(address)), encoding="utf-8", newline="\n")
     for path in pages(root):
         text = path.read_text(encoding="utf-8")
         if (new := installed_from_index(text)) != text:
-            path.write_text(new, encoding="utf-8")
+            path.write_text(new, encoding="utf-8", newline="\n")
 
 
 def problems(root: Path) -> list[str]:

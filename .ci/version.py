@@ -71,11 +71,11 @@ def write(root: Path, version: str, day: datetime.date) -> None:
     for file, pattern in (HELD, *REPEATED):
         path = root / file
         text = re.sub(pattern, rf"\g<1>{version}\g<3>", path.read_text(encoding="utf-8"))
-        path.write_text(text, encoding="utf-8")
+        path.write_text(text, encoding="utf-8", newline="\n")
     path = root / CITATION
     text = DAY.sub("", path.read_text(encoding="utf-8"))
     dated = f"version: {version}\ndate-released: {day.isoformat()}\n"
-    path.write_text(text.replace(f"version: {version}\n", dated), encoding="utf-8")
+    path.write_text(text.replace(f"version: {version}\n", dated), encoding="utf-8", newline="\n")
 
 
 def main() -> int:
