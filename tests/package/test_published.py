@@ -151,7 +151,7 @@ esac
     )
     (tmp_path / "cargo").chmod(0o755)
     environment = os.environ | {"PATH": f"{tmp_path}:{os.environ['PATH']}"}
-    command = [ROOT / ".ci" / "publish.sh", "--dry-run"]
+    command: list[str | Path] = [ROOT / ".ci" / "publish.sh", "--dry-run"]
     done = subprocess.run(command, capture_output=True, text=True, env=environment, check=True)
     ran = [line for line in done.stdout.splitlines() if line.startswith("ran ")]
     assert ran == ([f"ran publish --locked {published} --dry-run"] if published else [])
