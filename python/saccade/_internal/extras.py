@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.metadata
 import importlib.util
 import os
 import shlex
@@ -127,10 +126,12 @@ def pip_install(*arguments: str) -> str:
 
 def install_lab(extra: str) -> str:
     """How to install saccade-vla-lab with an extra: from where saccade itself was installed."""
+    from importlib.metadata import version  # not at the top, as above
+
     if (command := _install("lab", extra)) is not None:
         return command
     if _is_from_an_index():
-        return pip_install(f"saccade-vla-lab[{extra}]=={importlib.metadata.version('saccade-vla')}")
+        return pip_install(f"saccade-vla-lab[{extra}]=={version('saccade-vla')}")
     return f"{pip_install(f'./lab[{extra}]')} (in a clone of saccade)"
 
 
@@ -139,9 +140,11 @@ def _is_from_an_index() -> bool:
 
     Installers note the address of everything else beside the package's metadata (PEP 610).
     """
+    from importlib.metadata import PackageNotFoundError, distribution
+
     try:
-        return importlib.metadata.distribution("saccade-vla").read_text("direct_url.json") is None
-    except importlib.metadata.PackageNotFoundError:  # a folder on the path of modules
+        return distribution("saccade-vla").read_text("direct_url.json") is None
+    except PackageNotFoundError:  # a folder on the path of modules
         return False
 
 
