@@ -27,6 +27,7 @@ mod backbone;
 mod config;
 mod engine;
 mod error;
+mod gram;
 mod head;
 mod inspect;
 mod nn;
@@ -45,6 +46,7 @@ mod release;
 mod rewrite;
 mod sampling;
 mod standalone_cross_attention;
+mod watch;
 mod workspaces;
 
 pub use array::{Array, ArrayMut, OwnedArray};
@@ -55,6 +57,7 @@ pub use backbone::{
 pub use config::HeadConfig;
 pub use engine::Engine;
 pub use error::{Error, ErrorKind, Problem, Result};
+pub use gram::Gram;
 pub use head::action_head::ActionHead;
 pub use head::context::Context;
 pub use head::encode::Features;
@@ -85,7 +88,8 @@ pub use release::Version;
 #[cfg(feature = "rewrite")]
 pub use rewrite::{
     ConvertOptions, ConvertReport, Float, MergedTokens, QuantizeReport, ResizeOptions, ResizeReport,
-    RewriteOptions, Written, convert, merge_future_tokens, open_base, quantize, resize, resized_config,
+    RewriteOptions, Rounded, Written, convert, gptq, merge_future_tokens, open_base, quantize, resize,
+    resized_config,
 };
 pub use saccade_vla_checkpoint as files;
 #[cfg(feature = "peak")]
@@ -96,3 +100,4 @@ pub use saccade_vla_kernels::{
 pub use sampling::chunking::Chunking;
 pub use sampling::integrator::Integrator;
 pub use standalone_cross_attention::{CrossAttention, KeyOptions, KeyValues};
+pub use watch::{LinearWatch, WatchedLinear};

@@ -8,12 +8,15 @@ use crate::error::Result;
 use crate::ops::{check_interrupted, refused};
 use crate::precision::Role;
 use crate::profile::{Part, counted_by};
+use crate::watch::note;
 
 /// A linear layer: `weight (out_features, in_features)` and, if it has one, `bias (out_features)`.
 pub(crate) struct Linear {
     packed: PackedLinear,
     /// The part that its work is counted under; `None` does not count it.
     part: Option<Part>,
+    /// The names of its weights, for those who watch its inputs; none of a layer that was packed elsewhere.
+    weights: Vec<String>,
 }
 
 impl Linear {
@@ -51,6 +54,7 @@ impl Linear {
         let (builder, shape) = &parts[0];
         let in_features = shape[1..].iter().product();
         let mut tensors = Vec::with_capacity(parts.len());
+        let names = parts.iter().map(|(weights, _)| weights.name("weight")).collect();
         for (weights, shape) in parts {
             let weight = weights.weight(role, shape)?;
             let bias = has_bias.then(|| weights.bias("bias", shape[0])).transpose()?;
@@ -67,12 +71,20 @@ impl Linear {
                 builder.give_back(weight);
             }
         }
-        Ok(Self { packed, part: None })
+        Ok(Self {
+            packed,
+            part: None,
+            weights: names,
+        })
     }
 
     /// A layer that is packed already.
     pub(crate) fn packed(packed: PackedLinear) -> Self {
-        Self { packed, part: None }
+        Self {
+            packed,
+            part: None,
+            weights: Vec::new(),
+        }
     }
 
     /// The layer, its work counted under `part`.
@@ -99,7 +111,12 @@ impl Linear {
         epilogue: Epilogue,
         out: RowsMut<'_>,
     ) -> Result<()> {
-        let Self { packed, part } = self;
+        let Self {
+            packed,
+            part,
+            weights,
+        } = self;
+        note(weights, x, kernels.engine.threads)?;
         let multiply_adds = x.num_rows() * packed.in_features() * packed.out_features();
         let work = (multiply_adds, packed.nbytes());
         let applied = counted_by(Some(packed.kernel_name()), *part, work, || {

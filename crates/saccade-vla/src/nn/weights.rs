@@ -54,7 +54,8 @@ impl Weights<'_> {
         }
     }
 
-    fn name(&self, name: impl std::fmt::Display) -> String {
+    /// The name of a tensor.
+    pub(crate) fn name(&self, name: impl std::fmt::Display) -> String {
         match self.path.as_str() {
             "" => name.to_string(),
             path => format!("{path}.{name}"),

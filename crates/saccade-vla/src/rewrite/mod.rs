@@ -6,6 +6,7 @@ mod float;
 mod json_edit;
 mod quantize;
 mod resize;
+mod rounding;
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -22,6 +23,7 @@ pub use convert::{ConvertOptions, ConvertReport, convert};
 pub use float::Float;
 pub use quantize::{QuantizeReport, quantize};
 pub use resize::{MergedTokens, ResizeOptions, ResizeReport, merge_future_tokens, resize, resized_config};
+pub use rounding::{Rounded, gptq};
 
 /// Published checkpoints are cut into files of this size.
 const MAX_SHARD_BYTES: u64 = 5_000_000_000;
