@@ -22,7 +22,7 @@ pub enum Elements {
     Int4 {
         /// The integers in two's complement, the first one in the low half of its byte. Rows are whole bytes.
         values: Vec<u8>,
-        /// As those of int8.
+        /// As those of int8, 7 times them finite.
         scales: Vec<f32>,
     },
 }
@@ -69,10 +69,11 @@ pub(crate) fn check_quantized(
     scale: &str,
     scales: &[f32],
 ) -> std::result::Result<(), String> {
-    let is_good = |scale: &f32| (127.0 * scale).is_finite() && *scale >= 0.0;
+    let most = if is_int4 { 7.0 } else { 127.0 };
+    let is_good = |scale: &f32| (most * scale).is_finite() && *scale >= 0.0;
     if let Some(row) = scales.iter().position(|scale| !is_good(scale)) {
         return Err(format!(
-            "{scale} is {} at index {row}, expected finite scales that are not negative, and 127 times them finite",
+            "{scale} is {} at index {row}, expected finite scales that are not negative, and {most} times them finite",
             scales[row]
         ));
     }

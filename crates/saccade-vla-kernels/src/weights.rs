@@ -213,7 +213,7 @@ pub fn quantize_rows(weight: WeightRef<'_>, values: &mut [i8], scales: &mut [f32
 /// that are int4 already are copied.
 ///
 /// # Panics
-/// If `values` or `scales` have another length.
+/// If `values`, `scales` or the rows of int4 weights have another length.
 ///
 /// ```
 /// use saccade_vla_kernels::{Matrix, WeightRef, quantize_rows_int4};
@@ -237,6 +237,11 @@ pub fn quantize_rows_int4(weight: WeightRef<'_>, values: &mut [u8], scales: &mut
         ..
     } = weight
     {
+        assert_eq!(
+            from.num_columns(),
+            width,
+            "weight: expected bytes for {inputs} inputs"
+        );
         scales.copy_from_slice(from_scales);
         for (row, to) in values.chunks_exact_mut(width.max(1)).enumerate() {
             elements(from, row, |k, pair| to[k] = pair);

@@ -6,7 +6,8 @@ use common::linear::{apply, int4, int4_bytes, pack};
 use common::{bits, isas, numbers};
 use half::bf16;
 use saccade_vla_kernels::{
-    Arithmetic, Element, Epilogue, Matrix, PackedLinear, WeightRef, quantize_rows, quantize_rows_int4,
+    Arithmetic, Element, Epilogue, KernelError, Matrix, PackedLinear, WeightRef, quantize_rows,
+    quantize_rows_int4,
 };
 
 #[test]
@@ -315,4 +316,36 @@ fn rows_of_zeros_and_of_what_is_not_finite_are_zeros_in_int4() {
     );
     assert_eq!(pairs, [0; 6]);
     assert!(scales[0] == 0.0 && scales[1].is_nan() && scales[2].is_nan());
+}
+
+#[test]
+fn int4_that_is_not_whole_bytes_of_two_weights_is_refused() {
+    let scales = [1.0, 1.0];
+    let packed = |values: &[u8], bytes: usize, in_features: usize| {
+        let weight = WeightRef::Int4 {
+            values: Matrix::new(values, bytes),
+            in_features,
+            scales: &scales,
+        };
+        PackedLinear::pack(isas()[0], Arithmetic::Int4, 1, &[(weight, None)])
+    };
+    assert!(packed(&[0x11; 6], 3, 6).is_ok() && packed(&[0x01; 6], 3, 5).is_ok());
+    for (bytes, in_features) in [(2, 5), (2, 6), (3, 4), (3, 7)] {
+        let error = packed(&vec![0x01; 2 * bytes], bytes, in_features).err().unwrap();
+        let expected = in_features.div_ceil(2);
+        let message =
+            format!("int4 weights of {in_features} in_features have rows of {expected} bytes, got {bytes}");
+        assert_eq!(error.to_string(), message);
+    }
+    let error = packed(&[1, 1, 1, 1, 1, 0x21], 3, 5).err().unwrap();
+    assert!(
+        matches!(
+            error,
+            KernelError::Int4Padding {
+                row: 1,
+                in_features: 5
+            }
+        ),
+        "{error}"
+    );
 }

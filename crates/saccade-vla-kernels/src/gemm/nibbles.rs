@@ -3,7 +3,7 @@
 //!
 //! A weight `w` from -7 to 7 is unpacked as the byte `16 w`, which takes two operations for two words. Sums are
 //! then those of int8 times 16, exactly, and a sixteenth goes into the columns' scales: results have the bits that
-//! int8 has with the same weights.
+//! int8 has with the same weights, unless a sixteenth of a scale is no normal number (below 1.9e-37 the scale).
 //!
 //! Whether panels are so is known at run time, not by a type: the loops of int8 are most of what this crate compiles,
 //! and would be compiled twice.
@@ -36,7 +36,7 @@ pub(super) fn packed_words(words: usize, group: usize) -> usize {
 /// Unpacks rows of a panel, of `row` words each, as twice as many rows of int8.
 ///
 /// # Panics
-/// If `row` is not a number of whole vectors, or `to` has no room.
+/// If `row` is not a number of whole vectors, `panel` not one of whole rows, or `to` has no room.
 pub(super) struct Unpack<'a> {
     pub panel: &'a [u32],
     pub row: usize,
@@ -49,6 +49,7 @@ impl Kernel for Unpack<'_> {
     #[inline(always)]
     fn run<S: Simd>(&mut self, simd: S) {
         assert!(self.row.is_multiple_of(S::LANES), "rows of whole vectors");
+        assert!(self.panel.len().is_multiple_of(self.row), "whole rows");
         let to = self.to[..2 * self.panel.len()].chunks_exact_mut(2 * self.row);
         for (words, to) in self.panel.chunks_exact(self.row).zip(to) {
             let (low, high) = to.split_at_mut(self.row);

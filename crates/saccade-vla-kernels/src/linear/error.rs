@@ -37,6 +37,26 @@ pub enum KernelError {
         /// Its scales.
         given: usize,
     },
+    /// A row of int4 weights has another number of bytes than two weights each fill.
+    #[error("int4 weights of {in_features} in_features have rows of {expected} bytes, got {given}")]
+    Int4Bytes {
+        /// Inputs of the part.
+        in_features: usize,
+        /// Bytes that they fill.
+        expected: usize,
+        /// Bytes of a row.
+        given: usize,
+    },
+    /// The half of a byte after an odd number of int4 weights is not zero.
+    #[error(
+        "row {row} of int4 weights has {in_features} in_features, expected zero in the high half of its last byte"
+    )]
+    Int4Padding {
+        /// The first such row.
+        row: usize,
+        /// Inputs of the part.
+        in_features: usize,
+    },
     /// A sum of that many products could overflow.
     #[error("int8 and int4 arithmetic take at most {MAX_QUANTIZED_INPUTS} in_features, got {given}")]
     TooManyInputs {

@@ -26,7 +26,7 @@ use crate::weights::{Arithmetic, Element, WeightRef};
 pub use epilogue::Epilogue;
 use epilogue::{Dequantization, Finish};
 pub use error::KernelError;
-use pack::{Panels, check_panel, pack_panels, packed_element};
+use pack::{Panels, check_int4, check_panel, pack_panels, packed_element};
 pub use rows::LinearScratch;
 use rows::RowConversion;
 use schedule::Schedule;
@@ -120,6 +120,7 @@ impl PackedLinear {
                     given: scales.len(),
                 });
             }
+            check_int4(weight)?;
             out_features = out_features
                 .checked_add(outputs)
                 .filter(|&sum| sum <= isize::MAX as usize)

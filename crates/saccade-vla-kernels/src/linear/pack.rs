@@ -82,6 +82,29 @@ pub(super) fn check_panel(in_features: usize) -> Result<(), AllocError> {
     elements(padded, MAX_NR * size_of::<u32>()).map(drop)
 }
 
+/// Checks that rows of int4 are whole bytes, and that nothing follows their last weight.
+pub(super) fn check_int4(weight: &WeightRef<'_>) -> Result<(), KernelError> {
+    let WeightRef::Int4 {
+        values, in_features, ..
+    } = *weight
+    else {
+        return Ok(());
+    };
+    let (expected, given) = (in_features.div_ceil(2), values.num_columns());
+    if given != expected {
+        return Err(KernelError::Int4Bytes {
+            in_features,
+            expected,
+            given,
+        });
+    }
+    let is_padded = |row: usize| in_features % 2 == 0 || values.get(row, expected - 1) >> 4 == 0;
+    match (0..values.num_rows()).find(|&row| !is_padded(row)) {
+        Some(row) => Err(KernelError::Int4Padding { row, in_features }),
+        None => Ok(()),
+    }
+}
+
 /// The element that weights, which `are_bf16` or are not, are packed as.
 pub(super) fn packed_element(
     arithmetic: Arithmetic,

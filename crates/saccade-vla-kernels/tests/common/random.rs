@@ -4,7 +4,7 @@
 use half::bf16;
 use saccade_vla_kernels::{
     Arithmetic, Epilogue, Isa, LinearScratch, LogitBias, Mask, Matrix, PackedLinear, Rows, WeightRef,
-    attention,
+    attention, quantize_rows_int4,
 };
 
 use super::attention::{BF16_ROUNDING, Case, ELEMENTS, Kind, REMOVED, kinds_of};
@@ -160,14 +160,33 @@ impl Layer {
         out.values()[rows.start * self.outputs..rows.end * self.outputs].to_vec()
     }
 
+    /// The weights that are multiplied, `(outputs, inputs)`: of int4 what [`quantize_rows_int4`] makes of them.
+    fn multiplied(&self, arithmetic: Arithmetic) -> Vec<f32> {
+        let (inputs, outputs) = (self.inputs, self.outputs);
+        let mut weights: Vec<f32> = (0..outputs * inputs)
+            .map(|place| self.weight(place / inputs, place % inputs))
+            .collect();
+        if arithmetic == Arithmetic::Int4 {
+            let mut values = vec![0; outputs * inputs.div_ceil(2)];
+            let mut scales = vec![0.0; outputs];
+            let given = WeightRef::F32(Matrix::new(&weights, inputs));
+            quantize_rows_int4(given, &mut values, &mut scales);
+            for (place, weight) in weights.iter_mut().enumerate() {
+                let (output, input) = (place / inputs, place % inputs);
+                let pair = values[output * inputs.div_ceil(2) + input / 2];
+                let half = if input % 2 == 0 { pair << 4 } else { pair & 0xf0 };
+                *weight = f32::from(half.cast_signed() >> 4) * scales[output];
+            }
+        }
+        weights
+    }
+
     /// Each result in float64, with what rounding may change.
     fn exact(&self, arithmetic: Arithmetic) -> (Vec<f64>, Vec<f64>) {
         let (x, before) = (self.x.view(), self.before.values());
-        let largest_weight = |output| {
-            let row = (0..self.inputs).map(|input| f64::from(self.weight(output, input)).abs());
-            row.fold(0.0, f64::max)
-        };
-        let largest: Vec<f64> = (0..self.outputs).map(largest_weight).collect();
+        let weights = self.multiplied(arithmetic);
+        let largest_weight = |row: &[f32]| row.iter().fold(0.0, |most: f64, w| most.max(f64::from(w.abs())));
+        let largest: Vec<f64> = weights.chunks_exact(self.inputs).map(largest_weight).collect();
         let (mut results, mut bounds) = (Vec::new(), Vec::new());
         for row in 0..self.rows {
             let x: Vec<f64> = x.row(row).iter().map(|&value| f64::from(value)).collect();
@@ -175,14 +194,14 @@ impl Layer {
             let x_step = x.iter().fold(0.0, |largest: f64, value| largest.max(value.abs())) / 63.0;
             for output in 0..self.outputs {
                 let bias = self.bias.as_ref().map_or(0.0, |bias| f64::from(bias[output]));
-                // Half a step of the weights at least; weights of four bits may be clipped, and are then further off.
+                // Half a step of the weights at least; those of four bits are rounded already.
                 let w_step = match arithmetic {
-                    Arithmetic::Int4 => largest[output] * 7.5 / 12.0,
-                    _ => largest[output] / 254.0,
-                } * (1.0 + 1e-6);
+                    Arithmetic::Int4 => 0.0,
+                    _ => largest[output] / 254.0 * (1.0 + 1e-6),
+                };
                 let (mut sum, mut magnitude, mut error) = (bias, bias.abs(), 0.0);
                 for (input, &x) in x.iter().enumerate() {
-                    let w = f64::from(self.weight(output, input));
+                    let w = f64::from(weights[output * self.inputs + input]);
                     sum += w * x;
                     magnitude += (w * x).abs();
                     error += match arithmetic {

@@ -171,7 +171,7 @@ unsafe fn panel_rows<S: Simd, E: Step<Lanes>, const NV: usize>(
                 rows,
             };
             // SAFETY: the rows are in the block, their sums within the block's, and the part within the
-            // panel.
+            // panel, or, of nibbles, within what was unpacked of it, all of which was written.
             unsafe {
                 match tile.rows.len().div_ceil(E::GROUP) {
                     1 => tile_part::<S, E, NV, 1>(simd, block, &part, &tile),
