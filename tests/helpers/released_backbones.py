@@ -9,9 +9,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 import saccade
+from saccade import _saccade
+from saccade.policy.loading import BACKBONE
 from tests.helpers import paths
 from tests.helpers.tensor_files import read_tensor_file
 
@@ -37,6 +40,13 @@ class ReleasedBackbone:
         return saccade.Backbone.from_pretrained(
             self.path, config=self.about, precision=precision, num_threads=num_threads
         )
+
+    def tensors(self) -> dict[str, torch.Tensor]:
+        """The weights by their names without the prefix."""
+        names = _saccade.tensor_names(str(self.path))
+        prefix = next(one for one in BACKBONE if any(name.startswith(one) for name in names))
+        stored = _saccade.read_tensors(str(self.path), prefix)
+        return {name: torch.from_numpy(array.copy()) for name, array in stored.items()}
 
     @property
     def pixel_values(self) -> Any:
