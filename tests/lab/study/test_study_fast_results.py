@@ -7,6 +7,7 @@ from typing import Any
 
 import pandas as pd
 
+from saccade._internal.arrays import PRECISIONS
 from saccade_lab.study.questions import fast_results
 from saccade_lab.study.questions.fast_results import BASELINE, ONE_STEP
 from saccade_lab.study.questions.fast_section import section
@@ -131,6 +132,21 @@ def test_verdicts_and_the_recommendation() -> None:
         if cells["verdict"]:
             assert difference is not None
             assert cells["verdict"] == verdict(difference.difference)
+
+
+def test_modes_of_every_precision_are_drawn_in_their_order() -> None:
+    modes = [f"{precision}-euler-4" for precision in PRECISIONS]
+    rules = {mode: lambda seed: seed % 10 > 0 for mode in reversed(modes)}
+    table = pd.concat(
+        [
+            outcomes({**rules, ONE_STEP: lambda seed: seed % 10 > 5}),
+            pd.DataFrame([timed(mode, 10.0 + place) for place, mode in enumerate([ONE_STEP, *modes])]),
+        ]
+    )
+    assert list(fast_results.results_of(table)) == [ONE_STEP, *modes]
+    found = section_of(table)
+    assert found.figures
+    assert [row[list(found.grids[0].columns).index("mode")] for row in found.grids[0].rows][1:] == modes
 
 
 def test_no_loss_is_the_interval_that_excludes_it() -> None:

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import pandas as pd
 
+from saccade._internal.arrays import PRECISIONS
 from saccade_lab.study.statistics import (
     CONFIDENCE,
     LOSS_THAT_MATTERS,
@@ -160,8 +161,7 @@ def results_of(table: pd.DataFrame) -> dict[str, ModeResult]:
 def in_order(name: str) -> tuple[int, list[tuple[bool, float, str]]]:
     """A key for sorting: precisions in their order, numbers by size."""
     first, *rest = name.split("-")
-    precisions = ["float32", "bfloat16", "int8"]
-    return precisions.index(first), [
+    return PRECISIONS.index(first), [
         (not word.isdigit(), float(word) if word.isdigit() else 0.0, word) for word in rest
     ]
 

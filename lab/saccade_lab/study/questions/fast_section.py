@@ -9,6 +9,7 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure as Picture
 
+from saccade._internal.arrays import PRECISIONS
 from saccade_lab.study import changes, figures
 from saccade_lab.study.questions.fast_results import (
     BASELINE,
@@ -243,7 +244,7 @@ def scattered(
         falling: Small values are good, and the vertical axis is logarithmic too.
     """
     picture, (axes,) = figures.new_picture(height=4.6)
-    colours = dict(zip(("float32", "bfloat16", "int8"), figures.COLOURS, strict=False))
+    colours = dict(zip(PRECISIONS, figures.COLOURS, strict=False))
     sign = -1 if falling else 1
     best = frontier({name: (x.value, sign * y.value) for name, (x, y) in measured.items()})
     axes.plot(
