@@ -15,7 +15,7 @@ ROLLOUT_OUT ?= out/rollout
 ROLLOUT_ARGS ?= --episodes 3 --video
 
 SESSIONS := rollout test lint format docs workflows bench package setup core test-rust test-python test-compat test-clients test-ray test-libero \
-	test-aarch64 test-i686 bench-peers sanitize portable loom fuzz wheel metadata test-wheel demo-policy pictures lock
+	test-aarch64 test-i686 bench-peers rounding sanitize portable loom fuzz wheel metadata test-wheel demo-policy pictures lock
 
 .DEFAULT_GOAL := help
 MAKEFLAGS += --no-print-directory

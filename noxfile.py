@@ -204,6 +204,14 @@ def bench_peers(session: nox.Session) -> None:
     environment.run("-m", "benches.peers", *session.posargs, **variables)
 
 
+@nox.session
+def rounding(session: nox.Session) -> None:
+    """Round a trained model to four bits, layer by layer; `report --write` writes the page of docs."""
+    needs(session, "python", "rust")
+    environment = Environment(session, ENVIRONMENTS / "rounding").install("rounding").install_saccade()
+    environment.run("-m", "benches.rounding", *session.posargs)
+
+
 @nox.session(name="test-compat")
 def test_compat(session: nox.Session) -> None:
     """Test accelerate() and the plugin on lerobot releases; writes docs/results/compatibility.md.

