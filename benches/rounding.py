@@ -147,11 +147,11 @@ def in_groups(weight: Floats, scales_of: Callable[[Floats], Floats]) -> Floats:
     return steps(groups, scales_of(groups)).reshape(weight.shape)
 
 
-def calibrated(weight: Floats, x: Floats, scales: Floats | None = None) -> Floats:
+def calibrated(weight: Floats, x: Floats) -> Floats:
     """By saccade's GPTQ."""
     gram = _saccade.Gram(weight.shape[1])
     gram.add(np.ascontiguousarray(x, np.float32), 1)
-    scales = np.asarray(searched(weight) if scales is None else scales, np.float32)
+    scales = searched(weight).astype(np.float32)
     values, _ = _saccade.gptq(np.ascontiguousarray(weight, np.float32), scales, gram, 1)
     made: Floats = values.astype(np.float64) * scales.astype(np.float64)[:, None]
     return made

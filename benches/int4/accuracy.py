@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
@@ -140,9 +141,11 @@ def error(found: npt.NDArray[np.float64], exact: npt.NDArray[np.float64]) -> flo
 def copies(model: Model, work: Path) -> dict[str, Path]:
     """The checkpoint in four bits, rounded plainly and for observations."""
     folders = {"int4": work / "plain", "int4, calibrated": work / "calibrated"}
-    quantize(model.checkpoint, folders["int4"], to="int4", force=True)
+    for folder in folders.values():  # that of the model before has other files
+        shutil.rmtree(folder, ignore_errors=True)
+    quantize(model.checkpoint, folders["int4"], to="int4")
     given = Calibration(model.policy(), model.calibrated)
-    quantize(model.checkpoint, folders["int4, calibrated"], to="int4", calibration=given, force=True)
+    quantize(model.checkpoint, folders["int4, calibrated"], to="int4", calibration=given)
     return folders
 
 
@@ -152,7 +155,7 @@ def measure(model: Model, folders: dict[str, Path], note: Note) -> dict[str, Any
     actions, features = actions_of(exact, model.measured), features_of(exact, model.measured)
     other = np.roll(actions, 1, axis=1)  # of the same observation, another sample
     found: dict[str, Any] = {"other noise": {"actions": error(other, actions), "features": 0.0}}
-    runs = {"bfloat16": (None, "bfloat16"), "int8": (None, "int8")}
+    runs: dict[str, tuple[Path | None, str]] = {"bfloat16": (None, "bfloat16"), "int8": (None, "int8")}
     runs |= {name: (folder, "int4") for name, folder in folders.items()}
     for name, (folder, precision) in runs.items():
         policy = model.policy(folder, precision)

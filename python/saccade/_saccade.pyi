@@ -30,6 +30,7 @@ __all__ = [
     "BackboneFeatures",
     "Context",
     "CrossAttention",
+    "Gram",
     "HeadCheckpoint",
     "KeyValues",
     "Policy",
@@ -43,6 +44,7 @@ __all__ = [
     "cpu_report",
     "default_num_threads",
     "dot_products",
+    "gptq",
     "linear_cka",
     "measure_peaks",
     "merge_future_tokens",
@@ -51,13 +53,17 @@ __all__ = [
     "principal_angles",
     "profile",
     "quantize",
+    "quantized_weights",
     "read_stored",
     "read_tensors",
     "resize",
+    "round_layer",
+    "rounded_layer",
     "selected_isa",
     "stay_on_this_thread",
     "tensor_names",
     "tensor_shapes",
+    "watch_linears",
 ]
 
 __version__: str
@@ -350,6 +356,8 @@ class HeadCheckpoint:
     def evidence(self) -> list[str]: ...
     @property
     def files(self) -> list[Path]: ...
+    @property
+    def metadata(self) -> dict[str, str]: ...
     def kept_embodiments(self) -> list[int] | None: ...
     def tensors(self) -> list[tuple[str, str, list[int], int]]: ...  # name, type, shape, bytes in the file
     def check(self) -> None: ...
@@ -375,6 +383,9 @@ def read_stored(source: str) -> dict[str, tuple[str, list[int], bytes]]: ...  # 
 def read_tensors(source: str, prefix: str) -> dict[str, _Float32]: ...
 def tensor_names(source: str) -> list[str]: ...
 def quantize(rewrite: dict[str, Any], to: str) -> dict[str, Any]: ...
+def quantized_weights(
+    rewrite: dict[str, Any],
+) -> tuple[str, str | None, set[str]]: ...  # prefixes of head and backbone; names
 def convert(
     rewrite: dict[str, Any], embodiment_ids: list[int] | None, dtype: str | None, adapter: str | None
 ) -> dict[str, Any]: ...
@@ -384,6 +395,32 @@ def resize(
 def merge_future_tokens(
     tokens: _Float32, num_future_tokens: int, key_bias: list[float] | None = None
 ) -> tuple[_Float32, list[list[int]], list[float] | None]: ...  # rows, their tokens, key biases
+
+@final
+class Gram:
+    def __new__(cls, width: int) -> Gram: ...
+    @property
+    def width(self) -> int: ...
+    @property
+    def num_rows(self) -> int: ...
+    def add(self, x: _Float32, num_threads: int) -> None: ...
+    def matrix(self) -> _Float32: ...
+
+def gptq(
+    weight: _Float32, scales: _Float32, gram: Gram, num_threads: int
+) -> tuple[npt.NDArray[np.int8], dict[str, float]]: ...  # whole numbers; errors of the outputs
+def round_layer(
+    checkpoint: HeadCheckpoint, names: list[str], gram: Gram, out: str, num_threads: int
+) -> dict[str, float]: ...  # errors of the outputs
+def rounded_layer(directory: str) -> tuple[list[str], dict[str, float]]: ...  # weights, errors
+
+@final
+class watch_linears:
+    def __new__(cls, wanted: list[str]) -> watch_linears: ...
+    def __enter__(self) -> watch_linears: ...
+    def __exit__(self, error: object, *_about: object) -> None: ...
+    def layers(self) -> list[tuple[list[str], int, Gram | None]]: ...  # weights, inputs, of those wanted
+
 def available_isas() -> list[str]: ...
 def selected_isa() -> str: ...
 def dot_products() -> list[str]: ...

@@ -23,8 +23,10 @@ from saccade.checkpoints.initialisation import Draw, distance, draw, is_as_drawn
 from saccade.checkpoints.inspection import inspect
 from saccade.checkpoints.survey import robust_z, token_statistics
 from saccade.errors import CheckpointError
+from saccade_lab.reference import random_weights
 from saccade_lab.reference.random_weights import CONFIGS, whole_config
 from tests.helpers import layout_heads, layouts
+from tests.helpers.reference_cases import small_config
 
 #: Of the fork's head, at published sizes: counted by hand from the released code's shapes.
 N15_PARTS = {
@@ -395,3 +397,36 @@ def test_bad_input_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str
     lines = capsys.readouterr().err.splitlines()
     assert len(lines) == 2
     assert "hf download nvidia/no-such-model" in lines[1]
+
+
+@pytest.mark.parametrize("to", ["int8", "int4"])
+def test_a_quantised_checkpoint_is_inspected_by_its_values(to: str, tmp_path: Path) -> None:
+    """Also where rows have an odd number of weights, and a byte of int4 is half empty."""
+    config = small_config(num_heads=2, head_dim=33, context_dim=62, hidden_dim=51)
+    source, out, again = tmp_path / "source", tmp_path / to, tmp_path / "again"
+    source.mkdir()
+    random_weights.write_checkpoint(source, config, seed=1)
+    quantize(source, out, to=to)
+    quantize(source, again, to=to)
+    expected, report = inspect(source), inspect(out, reference=again)
+    scales = dict.fromkeys(expected.parts, 0)
+    for tensor in report.tensors:
+        if tensor.name.endswith("_scale"):
+            scales[part_of(tensor.name.removeprefix(report.prefix))] += tensor.shape[0]
+    assert {name: part.parameters - scales[name] for name, part in report.parts.items()} == {
+        name: part.parameters for name, part in expected.parts.items()
+    }
+    shapes = {tensor.name: tensor.shape for tensor in report.tensors}
+    assert {tensor.name: shapes[tensor.name] for tensor in expected.tensors} == {
+        tensor.name: tensor.shape for tensor in expected.tensors
+    }
+    assert report.reference is not None
+    assert report.reference.different_shapes == []
+    assert all(part.identical == part.compared for part in report.reference.parts.values())
+    # Against the source, values differ by what rounding changes.
+    compared = inspect(out, reference=source).reference
+    assert compared is not None
+    assert compared.different_shapes == []
+    largest = max(part.largest_change for part in compared.parts.values())
+    assert 0 < largest < (0.02 if to == "int8" else 0.3)
+    json.dumps(dataclasses.asdict(report), allow_nan=False)

@@ -227,6 +227,7 @@ def test_all_that_is_missing_is_named_with_one_command(name: str, tmp_path: Path
         "evaluate": ["checkpoint", "recordings", "--out", "out"],
         "inspect --precision-check": ["frames", "checkpoint"],
         "libero": ["checkpoint"],
+        "quantize --calibrate": ["frames", "checkpoint", "--to", "int4", "--out", "out"],
         "serve": ["checkpoint"],
         "train": ["--demos", str(tmp_path), "--out", "out"],
     }

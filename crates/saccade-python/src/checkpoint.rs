@@ -80,7 +80,7 @@ type PyTensorFacts = (String, String, Vec<usize>, u64);
 
 /// An open checkpoint and what it is.
 #[pyclass(frozen, module = "saccade._saccade")]
-pub(crate) struct HeadCheckpoint(saccade_vla::HeadCheckpoint);
+pub(crate) struct HeadCheckpoint(pub(crate) saccade_vla::HeadCheckpoint);
 
 #[pymethods]
 impl HeadCheckpoint {
@@ -131,6 +131,12 @@ impl HeadCheckpoint {
         self.0.files().map(PathBuf::from).collect()
     }
 
+    /// What the files say of themselves.
+    #[getter]
+    fn metadata(&self) -> BTreeMap<String, String> {
+        self.0.checkpoint.metadata().clone()
+    }
+
     /// The embodiments that are left, if others were taken out.
     fn kept_embodiments(&self, py: Python<'_>) -> PyResult<Option<Vec<i64>>> {
         call(py, || self.0.kept_embodiments())
@@ -152,16 +158,8 @@ impl HeadCheckpoint {
         name: &str,
         index: Option<usize>,
     ) -> PyResult<Bound<'py, PyArrayDyn<f32>>> {
-        let checkpoint = &self.0.checkpoint;
-        let data = call(py, || {
-            let elements = match index {
-                None => checkpoint.read(name),
-                Some(index) => checkpoint.read_slices(name, index..index.saturating_add(1)),
-            };
-            Ok(elements?.into_f32()?)
-        })?;
-        let shape = checkpoint.shape(name).expect("a tensor that was read is there");
-        to_numpy(py, data, &shape[usize::from(index.is_some())..])
+        let (data, shape) = call(py, || self.0.read(name, index))?;
+        to_numpy(py, data, &shape)
     }
 
     fn nbytes(&self, py: Python<'_>, precision: Named<Precision>, num_embodiments: usize) -> PyResult<usize> {

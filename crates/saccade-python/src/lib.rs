@@ -18,6 +18,7 @@ mod machine;
 mod policy;
 mod processor;
 mod rewrite;
+mod rounding;
 
 use pyo3::prelude::*;
 
@@ -49,7 +50,9 @@ mod _saccade {
     #[pymodule_export]
     use crate::processor::{Processor, ProcessorSource};
     #[pymodule_export]
-    use crate::rewrite::{convert, merge_future_tokens, quantize, resize};
+    use crate::rewrite::{convert, merge_future_tokens, quantize, quantized_weights, resize};
+    #[pymodule_export]
+    use crate::rounding::{Gram, WatchLinears, gptq, round_layer, rounded_layer};
 
     #[pymodule_export]
     #[allow(non_upper_case_globals)]

@@ -1,6 +1,6 @@
 //! Writing changed copies of checkpoints.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
 use numpy::{PyArrayDyn, PyReadonlyArrayDyn, PyUntypedArrayMethods};
@@ -21,6 +21,7 @@ pub(crate) struct PyRewrite {
     config: Option<String>,
     head_only: bool,
     keep_backbone: bool,
+    rounded: Vec<PathBuf>,
     force: bool,
     metadata: BTreeMap<String, String>,
     max_shard_bytes: Option<u64>,
@@ -29,6 +30,18 @@ pub(crate) struct PyRewrite {
 }
 
 impl PyRewrite {
+    fn options(&self) -> RewriteOptions {
+        RewriteOptions {
+            config: self.config.clone(),
+            head_only: self.head_only,
+            keep_backbone: self.keep_backbone,
+            rounded: self.rounded.clone(),
+            force: self.force,
+            metadata: self.metadata.clone(),
+            max_shard_bytes: self.max_shard_bytes,
+        }
+    }
+
     /// Runs `work(source, out, options, progress)` without the interpreter.
     fn run<R: Send>(
         self,
@@ -41,14 +54,7 @@ impl PyRewrite {
         ) -> saccade_vla::Result<R>
         + Send,
     ) -> PyResult<R> {
-        let options = RewriteOptions {
-            config: self.config,
-            head_only: self.head_only,
-            keep_backbone: self.keep_backbone,
-            force: self.force,
-            metadata: self.metadata,
-            max_shard_bytes: self.max_shard_bytes,
-        };
+        let options = self.options();
         let mut raised = None;
         let result = call(py, || {
             work(&self.source, &self.out, options, &mut |done, total| {
@@ -82,9 +88,21 @@ pub(crate) fn quantize<'py>(
     })?;
     let dict = written_dict(py, &report.written)?;
     set_fields!(dict, report;
-        num_quantized num_copied head_bytes_before head_bytes_after num_quantized_backbone
+        num_quantized num_calibrated num_copied head_bytes_before head_bytes_after num_quantized_backbone
         backbone_bytes_before backbone_bytes_after backbone_copied);
     Ok(dict)
+}
+
+/// Which weights `quantize` would round: the prefix of the head's names, that of the backbone's, and all names.
+#[pyfunction]
+pub(crate) fn quantized_weights(
+    py: Python<'_>,
+    rewrite: PyRewrite,
+) -> PyResult<(&'static str, Option<&'static str>, BTreeSet<String>)> {
+    let found = call(py, || {
+        saccade_vla::quantized_weights(&rewrite.source, &rewrite.out, &rewrite.options())
+    })?;
+    Ok((found.head_prefix, found.backbone_prefix, found.names))
 }
 
 #[pyfunction]

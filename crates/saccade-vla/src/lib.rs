@@ -65,6 +65,7 @@ pub use head::guidance::Guidance;
 pub use head::load::LoadOptions;
 pub use head::plan::tensor_shapes;
 pub use head::sample::Sampling;
+pub use head::stored::TensorFacts;
 pub use head::velocity::NoisyActions;
 pub use inspect::groups::{Group, Groups, Tokens};
 pub use inspect::intervention::{Intervention, Patch};
@@ -81,15 +82,15 @@ pub use processor::{
     View,
 };
 pub use profile::{Counter, Part, Profile, Profiling};
-pub use recognise::{HeadCheckpoint, TensorFacts};
+pub use recognise::HeadCheckpoint;
 #[cfg(feature = "processor")]
 pub use release::Preprocessing;
 pub use release::Version;
 #[cfg(feature = "rewrite")]
 pub use rewrite::{
-    ConvertOptions, ConvertReport, Float, MergedTokens, QuantizeReport, ResizeOptions, ResizeReport,
-    RewriteOptions, Rounded, Written, convert, gptq, merge_future_tokens, open_base, quantize, resize,
-    resized_config,
+    ConvertOptions, ConvertReport, Float, MergedTokens, QuantizeReport, QuantizedWeights, ResizeOptions,
+    ResizeReport, RewriteOptions, Rounded, RoundedLayer, RoundingErrors, Written, convert, gptq,
+    merge_future_tokens, open_base, quantize, quantized_weights, resize, resized_config, round_layer,
 };
 pub use saccade_vla_checkpoint as files;
 #[cfg(feature = "peak")]

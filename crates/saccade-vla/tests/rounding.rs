@@ -165,8 +165,8 @@ proptest! {
         let (before, after) = (sum(&plain), sum(&found.values));
         prop_assert!(after < 0.8 * before, "{after}, before {before}");
         // With the hundredth that is added, for the errors that are reported.
-        prop_assert!(found.plain_error > before && found.plain_error < 1.5 * before);
-        prop_assert!(found.error > after && found.error < 1.5 * after);
+        prop_assert!(found.errors.plain > before && found.errors.plain < 1.5 * before);
+        prop_assert!(found.errors.rounded > after && found.errors.rounded < 1.5 * after);
         let again = rounded(&weight, &scales, &gram, 3);
         prop_assert_eq!(found, again, "the same bits on three threads");
     }
@@ -180,7 +180,7 @@ proptest! {
         let scales: Vec<f32> = scales(&weight, width).iter().map(|scale| 0.6 * scale).collect();
         let found = rounded(&weight, &scales, &gram(&x, width), 2);
         prop_assert_eq!(found.values, plain(&weight, &scales, width));
-        prop_assert_eq!(found.error, found.plain_error);
+        prop_assert_eq!(found.errors.rounded, found.errors.plain);
     }
 }
 
@@ -200,7 +200,7 @@ fn inputs_that_were_always_zero_are_rounded_for_themselves() {
     for (place, (found, plain)) in found.values.iter().zip(&plain).enumerate() {
         assert!(found == plain || place % width % 3 != 0);
     }
-    assert!(found.error < 0.6 * found.plain_error);
+    assert!(found.errors.rounded < 0.6 * found.errors.plain);
     let nothing = rounded(&weight, &scales, &Gram::new(width).unwrap(), 1);
     assert_eq!(nothing.values, plain, "no calibration at all");
 }
@@ -211,7 +211,7 @@ fn a_gram_matrix_of_fewer_rows_than_inputs_is_regular_enough() {
     let (x, weight) = (inputs(1, 5, width), numbers(2, 30 * width));
     let scales = scales(&weight, width);
     let found = rounded(&weight, &scales, &gram(&x, width), 1);
-    assert!(found.error < 0.2 * found.plain_error, "{found:?}");
+    assert!(found.errors.rounded < 0.2 * found.errors.plain, "{found:?}");
 }
 
 #[test]

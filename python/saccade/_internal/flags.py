@@ -203,14 +203,23 @@ def add_preprocessing(parser: Arguments) -> None:
     )
 
 
+#: What a directory of images is.
+PICTURES = "an image of each camera, named after it (front.png), or folders of them, one per observation"
+
+
 def add_pictures(parser: Arguments, flag: str) -> None:
     """Declares a directory of images with the given flag, an instruction and a state."""
     parser.add_argument(
         flag,
         type=Path,
         metavar="DIR",
-        help="an image of each camera, named after it (front.png), or folders of them, one per observation",
+        help=PICTURES,
     )
+    add_words_and_state(parser)
+
+
+def add_words_and_state(parser: Arguments) -> None:
+    """Declares the instruction and the state of observations that are images."""
     parser.add_argument("--instruction", metavar="TEXT", help="instruction to the robot")
     parser.add_argument(
         "--state",

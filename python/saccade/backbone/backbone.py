@@ -64,8 +64,9 @@ class Backbone(Loaded[_saccade.Backbone, BackboneConfig]):
                 that it does not contain are those of the published model. Default: the ``config.json`` in the
                 directory of the weights, if there is one.
             precision: ``"float32"``, ``"bfloat16"``, ``"int8"`` or ``"int4"``, as for
-                :meth:`saccade.ActionHead.from_pretrained`. The table of embeddings is kept in bfloat16, or in
-                float32 if it is stored so and the precision is float32.
+                :meth:`saccade.ActionHead.from_pretrained`. The token embeddings are kept in bfloat16, in
+                float32 if they are stored so and the precision is float32, and with ``"int8"`` and ``"int4"``
+                in int8 with a scale for each row.
 
         Raises:
             FileNotFoundError, PermissionError, CheckpointError, InputError: As

@@ -1,12 +1,14 @@
 """Checkpoints: what they contain, how their precisions differ, and changed copies. Needs no torch.
 
 `description` recognises layout and version, and `inspection` examines every tensor. `rewriting` quantises,
-converts and resizes. `precisions` compares the precisions of a whole checkpoint, and `comparison` the actions
-of a checkpoint and its resized copy. `verification` checks all of a checkpoint and runs it.
+converts and resizes; `calibration` rounds weights for what their layers are given. `precisions` compares the
+precisions of a whole checkpoint, and `comparison` the actions of a checkpoint and its resized copy.
+`verification` checks all of a checkpoint and runs it.
 """
 
 from pathlib import Path
 
+from saccade.checkpoints.calibration import Calibration
 from saccade.checkpoints.comparison import ActionChanges, action_changes
 from saccade.checkpoints.description import Description, describe, read_tensors
 from saccade.checkpoints.findings import Inspection
@@ -25,6 +27,7 @@ from saccade.checkpoints.verification import Verification, verify
 
 __all__ = [
     "ActionChanges",
+    "Calibration",
     "ConvertReport",
     "Description",
     "Inspection",

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import json
-import math
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,6 +18,10 @@ from saccade.head.config import HeadConfig, to_json
 Source = str | os.PathLike[str]
 #: A config: a mapping, the path of a JSON file, or None for the one that belongs to the checkpoint.
 Config = Mapping[str, Any] | str | os.PathLike[str] | None
+
+
+#: What the files' metadata say of the calibration of their weights: JSON.
+CALIBRATION = "saccade_calibration"
 
 
 @dataclass(frozen=True)
@@ -38,6 +41,7 @@ class StoredTensor:
     dtype: str
     """In the names of safetensors, such as ``"BF16"``."""
     shape: list[int]
+    """The shape of its values; int4, stored as ``"U8"``, has two in a byte."""
     nbytes: int
     """Size in the file, in bytes."""
 
@@ -108,16 +112,6 @@ def description_of(published: _saccade.HeadCheckpoint, source: Source) -> Descri
         files=[File(str(file), file.stat().st_size) for file in published.files],
         tensors=[StoredTensor(*tensor) for tensor in published.tensors()],
     )
-
-
-def num_values(dtype: str, shape: Sequence[int]) -> int:
-    """The number of values of a stored tensor; a byte of int4, which is stored as U8, has two.
-
-    Example:
-        >>> num_values("U8", (3, 4)), num_values("I8", (3, 8))
-        (24, 24)
-    """
-    return math.prod(shape) * (2 if dtype == "U8" else 1)
 
 
 def read_tensors(source: Source, prefix: str = "") -> dict[str, Float32Array]:

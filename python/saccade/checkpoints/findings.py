@@ -169,6 +169,8 @@ class Resemblance:
 class Inspection(Description):
     """What :func:`saccade.checkpoints.inspection.inspect` found."""
 
+    rounding: str | None
+    """How int4 weights were rounded, a sentence; None if there are none."""
     parts: dict[str, Part]
     parameters: int
     """Number of values of the whole head."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -9,13 +10,20 @@ from typing import Any
 from saccade._internal.arrays import PRECISIONS
 from saccade._internal.hub import resolve
 from saccade._internal.small_files import read_json
-from saccade.checkpoints.description import Config, Description, Source, description_of, open_published
+from saccade.checkpoints.description import (
+    CALIBRATION,
+    Config,
+    Description,
+    Source,
+    description_of,
+    open_published,
+)
 from saccade.checkpoints.evidence import from_noise, odd_embodiments, odd_tokens
 from saccade.checkpoints.findings import Counts, Inspection, Memory
 from saccade.checkpoints.resemblance import Reference
 from saccade.checkpoints.survey import Survey, token_statistics
 from saccade.checkpoints.whole import backbone_of, robots_of
-from saccade.errors import InputError, SaccadeError
+from saccade.errors import CheckpointError, InputError, SaccadeError
 from saccade.head.config import to_json
 from saccade.robots import DataConfigLike
 from saccade.robots.embodiments import IDS
@@ -80,6 +88,7 @@ def inspect(
     resemblance = None if other is None else other.resemblance()
     return Inspection(
         **vars(description),
+        rounding=_rounding(description, published.metadata.get(CALIBRATION)),
         parts=parts,
         parameters=sum(part.parameters for part in parts.values()),
         outside=outside,
@@ -97,6 +106,19 @@ def inspect(
         odd=survey.odd + odd_tokens(tokens, description) + odd_embodiments(embodiments),
         from_noise=from_noise(head.version, parts, tokens, embodiments, resemblance),
     )
+
+
+def _rounding(description: Description, calibration: str | None) -> str | None:
+    """How int4 weights were rounded, by what the files say of it."""
+    if not any(tensor.dtype == "U8" for tensor in description.tensors):
+        return None
+    if calibration is None:
+        return "each weight to the nearest, without calibration"
+    try:
+        count = json.loads(calibration)["observations"]
+    except (ValueError, RecursionError, KeyError, TypeError):
+        raise CheckpointError(f"source: {CALIBRATION} in the metadata is {calibration!r:.80}") from None
+    return f"for what the layers are given on {count} observations (GPTQ)"
 
 
 def _outside(description: Description) -> dict[str, Counts]:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import os
-from collections.abc import Callable, Sequence
+import shutil
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,7 +15,8 @@ from saccade._internal.arrays import integer, optional_integers, text
 from saccade._internal.files import sha256_of
 from saccade._internal.hub import resolve
 from saccade._internal.hub_files import WHOLE
-from saccade.checkpoints.description import Config, Source
+from saccade.checkpoints.calibration import Calibration, round_layers
+from saccade.checkpoints.description import CALIBRATION, Config, Source
 from saccade.errors import InputError
 from saccade.head.config import to_json
 
@@ -41,6 +44,12 @@ class QuantizeReport(Written):
 
     num_quantized: int
     """Number of weights that were converted to int8 or int4."""
+    num_calibrated: int
+    """How many of them were rounded for the observations of a calibration."""
+    rounding: Mapping[str, Mapping[str, float]] | None
+    """What rounding changed in each layer, by the name of its first weight; None without calibration. Sums
+    over its outputs on the observations: their squared error if each weight were rounded to the nearest
+    (``plain``) and as they were rounded (``rounded``), and their squares (``outputs``)."""
     num_copied: int
     """Number of tensors that were copied bit for bit."""
     head_bytes_before: int
@@ -116,10 +125,11 @@ def quantize(
     config: Config = None,
     head_only: bool = False,
     keep_backbone: bool = False,
+    calibration: Calibration | None = None,
     force: bool = False,
     progress: Progress = None,
 ) -> QuantizeReport:
-    """Writes a copy of a checkpoint with int8 or int4 weights: half of bfloat16, or a quarter.
+    """Writes a copy of a checkpoint with int8 or int4 weights: half the bytes of bfloat16, or a quarter.
 
     The weights of the attention and feed-forward layers of all blocks are quantised: those of the head, and
     those of a backbone that :class:`saccade.Backbone` loads. These are the weights that precision ``"int8"``
@@ -132,12 +142,15 @@ def quantize(
     - int4: uint8 ``X.weight (out_features, in_features / 2)``, rounded up, with two values from -7 to 7 in a
       byte: the first one in the low four bits, both in two's complement. If ``in_features`` is odd, the high
       four bits of a row's last byte are zero. The scale is the largest magnitude of the row / 7 times 1,
-      11/12, ... or 5/12, whichever gives the least squared error.
+      11/12, ... or 5/12, whichever gives the least squared error. Each weight is rounded to the nearest
+      integer; with ``calibration`` the integers are those that change the outputs of their layer least on
+      the observations (GPTQ, equation 55 of ``docs/equations.md``). The files say which.
 
     :meth:`saccade.ActionHead.from_pretrained`, :meth:`saccade.Backbone.from_pretrained` and
-    :meth:`saccade.Policy.from_pretrained` read the copy at every precision. At the precision ``to`` it gives
-    the same bits as the source at that precision. At the others, the weights are those that the integers
-    represent. No other program reads these weights.
+    :meth:`saccade.Policy.from_pretrained` read the copy at every precision. At the precision ``to``, and
+    without calibration, it gives the same bits as the source at that precision. At the others, the weights
+    are those that the integers represent, rounded again if that precision rounds weights. No other program
+    reads these weights.
 
     One tensor at a time is in memory. The directory appears under its name when everything is written.
 
@@ -149,6 +162,9 @@ def quantize(
         config: As for :meth:`saccade.ActionHead.from_pretrained`. It becomes the ``config.json`` of the copy.
         head_only: Whether to leave out tensors outside the head.
         keep_backbone: Whether to copy the tensors of a backbone bit for bit.
+        calibration: Observations for which int4 weights are rounded. It takes minutes for small policies and
+            hours for the published ones, mostly to run the observations. Finished layers are kept in
+            ``OUT.calibrating`` until the copy is written, and a call that was interrupted goes on with them.
         force: Whether to replace an existing checkpoint. A directory that contains other files is never
             replaced.
         progress: Called after each tensor with the number of bytes that are done and the total number of
@@ -159,7 +175,9 @@ def quantize(
         CheckpointError: The source is damaged, does not fit the config, is quantised already, or contains NaN
             or infinity. Or ``out`` cannot be written.
         InputError: ``to`` is another precision, ``out`` exists and ``force`` is not set, or it contains other
-            files or the source.
+            files or the source. Or ``calibration`` is given with int8, its policy is not that of the source
+            in float32, or ``OUT.calibrating`` belongs to another calibration.
+        ShapeError, DtypeError: An observation does not fit the policy.
 
     Example:
         >>> import saccade
@@ -172,7 +190,17 @@ def quantize(
     """
     rewrite = _rewrite(source, out, config, force=force, progress=progress, head_only=head_only)
     rewrite["keep_backbone"] = keep_backbone
-    return QuantizeReport(**_frozen(_saccade.quantize(rewrite, text("to", to))))
+    if calibration is None:
+        return QuantizeReport(**_frozen(_saccade.quantize(rewrite, text("to", to))), rounding=None)
+    if to != "int4":
+        raise InputError(f"calibration: expected None unless to is 'int4', got to={to!r}")
+    kept = Path(f"{os.fspath(out)}.calibrating")
+    rounded = round_layers(calibration, rewrite, kept)
+    rewrite["rounded"] = [os.fspath(path) for path in rounded.directories]
+    rewrite["metadata"][CALIBRATION] = json.dumps(rounded.note, sort_keys=True)
+    written = _saccade.quantize(rewrite, to)
+    shutil.rmtree(kept)
+    return QuantizeReport(**_frozen(written), rounding=rounded.errors)
 
 
 def convert(
@@ -335,6 +363,7 @@ def _rewrite(
         "config": config_text,
         "head_only": head_only,
         "keep_backbone": False,
+        "rounded": [],
         "force": force,
         "metadata": metadata,
         "max_shard_bytes": None,

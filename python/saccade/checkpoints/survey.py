@@ -13,7 +13,6 @@ import numpy as np
 
 import saccade._saccade as _saccade
 from saccade._internal.arrays import Float32Array
-from saccade.checkpoints.description import num_values
 from saccade.checkpoints.findings import (
     UNUSED,
     Embodiment,
@@ -84,7 +83,7 @@ class Survey:
             name = full_name.removeprefix(self._prefix)
             part = self._parts.setdefault(part_of(name), Part())
             part.tensors += 1
-            part.parameters += num_values(dtype, shape)
+            part.parameters += math.prod(shape)
             part.nbytes += nbytes
             part.dtypes[dtype] = part.dtypes.get(dtype, 0) + 1
             judged = []

@@ -5,6 +5,7 @@ One precision at a time is in memory.
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -15,7 +16,7 @@ import saccade._saccade as _saccade
 from saccade._internal.arrays import integer
 from saccade._internal.hub import resolve
 from saccade._internal.hub_files import WEIGHTS
-from saccade.checkpoints.description import Description, Source, description_of, num_values, open_published
+from saccade.checkpoints.description import Description, Source, description_of, open_published
 from saccade.checkpoints.finite import count_not_finite
 from saccade.checkpoints.trial import Reference, Run, lines_of, run_head, run_policy
 from saccade.checkpoints.whole import RobotFindings, robots_of
@@ -238,7 +239,7 @@ def _check_tensors(
             part = "neither"
         counts = found.tensors.setdefault(part, Tensors())
         counts.count += 1
-        counts.parameters += num_values(tensor.dtype, tensor.shape)
+        counts.parameters += math.prod(tensor.shape)
         counts.nbytes += tensor.nbytes
         counts.dtypes[tensor.dtype] = counts.dtypes.get(tensor.dtype, 0) + 1
     return backbone_prefix is not None

@@ -77,6 +77,7 @@ NEEDS: dict[str, tuple[str, ...]] = {
     "certify": ("pyarrow", "av"),
     "diagnose": ("pyarrow", "av"),
     "inspect --precision-check": ("PIL",),
+    "quantize --calibrate": ("PIL",),
 }
 
 # Failures of a path that the user named. Python raises these without an error number in places of our own.

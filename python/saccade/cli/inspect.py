@@ -115,6 +115,7 @@ def checkpoint(report: Inspection) -> Section:
         ["files", f"{len(report.files)}, {megabytes(size)} MB"],
         ["prefix of the head", report.prefix or "none"],
         ["outside the head", "; ".join(outside) or "nothing"],
+        *([["int4 weights", f"rounded {report.rounding}"]] if report.rounding else []),
         *listed("evidence", report.evidence),
     ]
     return Section(str(report.source), ["", ""], rows)

@@ -3,8 +3,29 @@
 from __future__ import annotations
 
 import argparse
+import math
+import statistics
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
+from saccade._internal import flags as arguments
+from saccade._internal.flags import UsageError
+from saccade.cli import output, require
 from saccade.cli.copying import add_copy_arguments, copy, print_report
+
+if TYPE_CHECKING:
+    from saccade.checkpoints import Calibration
+
+#: Observations of a data set that are calibrated with. A layer is given some hundred rows by each, so that
+#: all are a few times as many as the widest layer has inputs.
+OBSERVATIONS = 64
+
+#: The arguments that need `--calibrate`; None where they are not given.
+CALIBRATING = (
+    *("observations", "instruction", "state", "embodiment", "preprocessing", "tokenizer", "data_config"),
+    *("action_horizon", "processor_options", "seed", "num_threads"),
+)
 
 HELP = "write a checkpoint with int8 or int4 weights"
 
@@ -16,9 +37,14 @@ the other files of the checkpoint, such as statistics, processors and tokenizers
 precision="int8") gives the same bits as loading CHECKPOINT at int8, and so with int4. The other precisions
 load it too, with the dequantized weights. docs/precision.md says how much they change actions.
 
+--calibrate rounds int4 weights so that the outputs of their layers change least on observations of yours
+(GPTQ). The whole checkpoint is run in float32 on all of them, once for every gigabyte of matrices that this
+needs: minutes for a small policy, hours for a published one. It goes on where it was interrupted.
+
 examples:
   saccade quantize GR00T-N1.5-3B/ --out GR00T-N1.5-3B-int8
   saccade quantize GR00T-N1.5-3B/ --to int4 --out GR00T-N1.5-3B-int4
+  saccade quantize my-policy/ --to int4 --calibrate my-recordings/ --out my-policy-int4
   saccade quantize GR00T-N1.5-3B/ --out head-int8 --head-only --json
   saccade quantize policy.safetensors --config config.json --out policy-int8 --force
 """
@@ -35,6 +61,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--keep-backbone", action="store_true", help="copy the backbone's tensors as they are"
     )
+    seen = parser.add_argument_group("calibration of int4 (of a whole checkpoint)")
+    seen.add_argument(
+        "--calibrate",
+        metavar="DATASET|DIR",
+        help=f"directory or published id of a LeRobotDataset (extra: data); or {arguments.PICTURES}",
+    )
+    arguments.add_integer(
+        seen, "--observations", help=f"of a data set, evenly over all its steps (default: {OBSERVATIONS})"
+    )
+    arguments.add_words_and_state(seen)
+    arguments.add_preprocessing(seen)
+    arguments.add_data_config(seen)
+    arguments.add_overrides(seen)
+    arguments.add_integer(seen, "--seed", minimum=0, help="seed of the noise (default: 0)")
+    arguments.add_num_threads(seen, "threads (default: the physical cores)")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -42,7 +83,25 @@ def run(args: argparse.Namespace) -> int:
     from saccade.checkpoints import quantize
 
     chosen = {"to": args.to, "head_only": args.head_only, "keep_backbone": args.keep_backbone}
-    report = copy(quantize, "quantizing", args, **chosen)
+    if args.calibrate is None:
+        given = [name for name in CALIBRATING if getattr(args, name) is not None]
+        if given:
+            flags = ", ".join("--" + name.replace("_", "-") for name in given)
+            raise UsageError(f"{flags}: only with --calibrate")
+        report = copy(quantize, "quantizing", args, **chosen)
+    else:
+        if args.to != "int4":
+            raise UsageError(f"--calibrate: only with --to int4, given {args.to}")
+        with output.progress_bar("calibrating") as update:
+            report = quantize(
+                args.checkpoint,
+                args.out,
+                config=args.config,
+                force=args.force,
+                calibration=calibration(args, update),
+                progress=lambda done, total: update(done // 10**6, total // 10**6, "writing, MB"),
+                **chosen,
+            )
     lines = [
         f"{args.out}: {report.num_quantized} weights in {args.to}, {report.num_copied} tensors copied, "
         f"{report.num_dropped} left out; the head has {report.head_bytes_after / 1e6:.1f} MB "
@@ -53,4 +112,46 @@ def run(args: argparse.Namespace) -> int:
         lines.append(f"the backbone has {after:.1f} MB (was {before:.1f} MB)")
     elif report.backbone_copied is not None:
         lines.append(f"tensors outside the head were copied as they are: {report.backbone_copied}")
+    if report.rounding is not None:
+        before, after = (error(report.rounding, kind) for kind in ("plain", "rounded"))
+        lines.append(
+            f"{report.num_calibrated} weights were rounded for the observations; outputs of their layers "
+            f"differ by {after:.2%} in the median, and by {before:.2%} with plain rounding"
+        )
     return print_report(args, report, lines)
+
+
+def error(rounding: Mapping[str, Mapping[str, float]], kind: str) -> float:
+    """The median over layers of the error of the outputs relative to the outputs."""
+    squares = [one[kind] / one["outputs"] for one in rounding.values() if one["outputs"] > 0]
+    return math.sqrt(statistics.median(squares)) if squares else 0.0
+
+
+def calibration(args: argparse.Namespace, progress: output.Update) -> Calibration:
+    """The policy and the observations of the arguments."""
+    from saccade._internal import hub
+    from saccade.checkpoints import Calibration
+    from saccade.policy.policy import Policy
+
+    is_dataset = hub.parse(args.calibrate) is not None or (Path(args.calibrate) / "meta").is_dir()
+    wrong = ("instruction", "state") if is_dataset else ("observations",)
+    given = [name for name in wrong if getattr(args, name) is not None]
+    if given:
+        kind = "a data set" if is_dataset else "a directory of images"
+        raise UsageError(f"--{given[0]}: not with --calibrate {args.calibrate}, which is {kind}")
+    if not is_dataset:
+        require("quantize --calibrate")
+    policy = Policy.from_pretrained(args.checkpoint, **arguments.loading_options(args))
+    observations: Sequence[Any]
+    if is_dataset:
+        from saccade.datasets import open as open_recordings
+        from saccade.evaluation.recordings import SpacedObservations, fitted
+
+        data = fitted(policy, open_recordings(args.calibrate))
+        observations = SpacedObservations(policy, data, args.observations or OBSERVATIONS)
+    else:
+        from saccade.observations.pictures import read_frames
+
+        found = read_frames(Path(args.calibrate), policy, instruction=args.instruction, state=args.state)
+        observations = [one.observation for one in found]
+    return Calibration(policy, observations, seed=args.seed or 0, progress=progress)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import zipfile
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
@@ -11,8 +10,8 @@ from typing import Any, Generic, TypeVar
 
 import numpy as np
 
-from saccade._internal.files import write_atomically, write_json
-from saccade._internal.json import dumps
+from saccade._internal import run_settings
+from saccade._internal.files import write_atomically
 from saccade.errors import InputError
 
 Record = TypeVar("Record")
@@ -39,21 +38,11 @@ class EpisodeFiles(Generic[Record]):
             InputError: It has results of others, or without settings; lists the settings that differ.
             OSError: It cannot be written.
         """
-        now = json.loads(dumps(settings))
         file = self.folder / SETTINGS
-        if self.is_begun():
-            before = self.settings()
-            names = [name for name in {**before, **now} if before.get(name) != now.get(name)]
-            if names:
-                raise InputError(
-                    f"{self.folder.parent}: has results with other settings ({', '.join(names)} changed): "
-                    "choose another directory, or delete this one"
-                )
-            return
-        if self.places():
+        if not self.is_begun() and self.places():
             raise InputError(f"{file}: no such file, but results of episodes beside it: delete {self.folder}")
         self.folder.mkdir(parents=True, exist_ok=True)
-        write_json(file, now)
+        run_settings.begin(file, settings, self.folder.parent)
 
     def is_begun(self) -> bool:
         """Whether the directory has settings of a run."""
@@ -69,13 +58,7 @@ class EpisodeFiles(Generic[Record]):
         file = self.folder / SETTINGS
         if not file.is_file():
             raise FileNotFoundError(f"{file}: no such file; expected the directory of an earlier run")
-        try:
-            found = json.loads(file.read_text(encoding="utf-8"))
-        except (OSError, ValueError, RecursionError) as error:
-            raise InputError(f"{file}: cannot be read as JSON: {error}") from None
-        if not isinstance(found, dict):
-            raise InputError(f"{file}: expected a JSON object, got {type(found).__name__}")
-        return found
+        return run_settings.read(file)
 
     def path(self, episode: int) -> Path:
         """The file of an episode."""

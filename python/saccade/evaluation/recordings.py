@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence, Sized
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol, overload
 
 import numpy as np
 import numpy.typing as npt
@@ -100,6 +100,43 @@ def observation_at(policy: Policy, data: Recordings, episode: int, step: int) ->
         where = f"episode {episode}, step {step}: "
         raise type(error)(where + str(error)) if where not in str(error) else error from None
     return parsed
+
+
+class SpacedObservations(Sequence[ParsedObservation]):
+    """Observations of recordings, evenly over all steps, each read when it is asked for.
+
+    Args:
+        policy: The policy that they are parsed for.
+        data: The recordings, with the policy's keys.
+        count: Their number; fewer if there are not as many steps.
+
+    Raises:
+        InputError: There are no episodes, or one has no step.
+    """
+
+    def __init__(self, policy: Policy, data: Recordings, count: int) -> None:
+        self._policy, self._data = policy, data
+        lengths = [length_of(data, episode) for episode in chosen_episodes(data, None)]
+        ends = np.cumsum(lengths)
+        count = min(count, int(ends[-1]))
+        steps = (2 * np.arange(count) + 1) * int(ends[-1]) // (2 * count)
+        episodes = np.searchsorted(ends, steps, side="right")
+        starts = ends - lengths
+        self.places = [
+            (int(episode), int(step - starts[episode])) for episode, step in zip(episodes, steps, strict=True)
+        ]
+
+    def __len__(self) -> int:
+        return len(self.places)
+
+    @overload
+    def __getitem__(self, index: int) -> ParsedObservation: ...
+    @overload
+    def __getitem__(self, index: slice) -> list[ParsedObservation]: ...
+    def __getitem__(self, index: int | slice) -> ParsedObservation | list[ParsedObservation]:
+        if isinstance(index, slice):
+            return [self[one] for one in range(*index.indices(len(self)))]
+        return observation_at(self._policy, self._data, *self.places[index])
 
 
 def actions_of(policy: Policy, data: Recordings, episode: int, horizon: int) -> npt.NDArray[np.floating[Any]]:

@@ -78,9 +78,9 @@ class LoadedHead(Loaded[_saccade.ActionHead, HeadConfig]):
                 - ``"bfloat16"``: weights, inputs of linear layers, keys and values are rounded to bfloat16.
                   Half the memory of float32, and faster on a CPU with a bfloat16 dot product.
                 - ``"int8"``: the attention and feed-forward layers of all blocks multiply 8-bit integers,
-                  with a scale for each output of the weights and one for each row of the inputs. A quarter of
-                  the memory, and the fastest. Everything else is as in ``"bfloat16"``.
-                - ``"int4"``: as ``"int8"``, with weights of four bits. An eighth of the memory, and less
+                  with a scale for each output of the weights and one for each row of the inputs. About a
+                  quarter of the memory, and the fastest. Everything else is as in ``"bfloat16"``.
+                - ``"int4"``: as ``"int8"``, with weights of four bits in these layers. The smallest, and less
                   accurate.
 
                 ``docs/precision.md`` has the measured accuracy of each.

@@ -17,6 +17,7 @@ pub(crate) mod load;
 pub(crate) mod plan;
 pub(crate) mod sample;
 pub(crate) mod state_dropout;
+pub(crate) mod stored;
 mod trace;
 pub(crate) mod velocity;
 mod vl_encoder;

@@ -10,7 +10,9 @@ mod layout;
 mod lerobot;
 pub(crate) mod sizes;
 
+use std::collections::BTreeMap;
 use std::path::Path;
+use std::sync::OnceLock;
 
 use saccade_vla_checkpoint::{Checkpoint, directory_of, read_text};
 use serde_json::Value;
@@ -39,6 +41,8 @@ pub struct HeadCheckpoint {
     pub given_config: String,
     /// The evidence for the version, a sentence each.
     pub evidence: Vec<String>,
+    /// The shapes of the head's tensors by their names without the prefix, once one was needed.
+    pub(crate) shapes: OnceLock<BTreeMap<String, Vec<usize>>>,
 }
 
 impl HeadCheckpoint {
@@ -96,20 +100,7 @@ impl HeadCheckpoint {
             given_config,
             evidence,
             checkpoint,
-        })
-    }
-
-    /// All tensors of the checkpoint, sorted by name; without those that are in two files, which
-    /// [`HeadCheckpoint::check`] refuses in a head.
-    pub fn tensors(&self) -> impl Iterator<Item = TensorFacts> {
-        let checkpoint = &self.checkpoint;
-        checkpoint.names().filter_map(|name| {
-            Some(TensorFacts {
-                name: name.to_owned(),
-                dtype: format!("{:?}", checkpoint.dtype(name).ok()?),
-                shape: checkpoint.shape(name)?.to_vec(),
-                nbytes: checkpoint.nbytes(name).ok()?,
-            })
+            shapes: OnceLock::new(),
         })
     }
 
@@ -125,19 +116,6 @@ impl HeadCheckpoint {
     pub fn files(&self) -> impl Iterator<Item = &Path> {
         self.checkpoint.files()
     }
-}
-
-/// A tensor, by what its file's header says.
-#[derive(Clone, Debug)]
-pub struct TensorFacts {
-    /// Its name, prefix included.
-    pub name: String,
-    /// Its type in the words of safetensors: `F32`, `BF16`.
-    pub dtype: String,
-    /// Its shape.
-    pub shape: Vec<usize>,
-    /// Its bytes in the file.
-    pub nbytes: u64,
 }
 
 /// What the names of the head's tensors begin with: empty if no layout's prefix is used.

@@ -21,9 +21,9 @@ use adapter::is_beside;
 pub use adapter::open_base;
 pub use convert::{ConvertOptions, ConvertReport, convert};
 pub use float::Float;
-pub use quantize::{QuantizeReport, quantize};
+pub use quantize::{QuantizeReport, QuantizedWeights, quantize, quantized_weights};
 pub use resize::{MergedTokens, ResizeOptions, ResizeReport, merge_future_tokens, resize, resized_config};
-pub use rounding::{Rounded, gptq};
+pub use rounding::{Rounded, RoundedLayer, RoundingErrors, gptq, round_layer};
 
 /// Published checkpoints are cut into files of this size.
 const MAX_SHARD_BYTES: u64 = 5_000_000_000;
@@ -37,6 +37,9 @@ pub struct RewriteOptions {
     pub head_only: bool,
     /// Whether [`quantize`](crate::quantize) copies the tensors of a backbone bit for bit, and quantises the head alone.
     pub keep_backbone: bool,
+    /// Directories of layers that [`round_layer`](crate::round_layer) wrote, whose weights [`quantize`](crate::quantize) to int4 takes. It
+    /// rounds the others plainly.
+    pub rounded: Vec<PathBuf>,
     /// Whether to replace a checkpoint that exists.
     pub force: bool,
     /// Metadata of the files, added to the source's.
@@ -130,6 +133,31 @@ impl SourceCheckpoint {
         })
     }
 
+    /// The other files next to the source's weights that are copied to `out`, without those of these names.
+    fn companions<'a>(&self, out: &Path, without: impl Iterator<Item = &'a str>) -> Result<Companions> {
+        let files = self.checkpoint.files().chain(self.adapter.as_deref());
+        check_apart(&self.path, files, out)?;
+        let mut companions = Companions::of(&self.path, self.checkpoint.files())?;
+        if let Some(adapter) = &self.adapter {
+            let beside = is_beside(&self.path, adapter);
+            companions = companions.with_adapter(adapter, beside)?;
+        }
+        for name in without {
+            companions = companions.without(name);
+        }
+        Ok(companions)
+    }
+
+    /// Checks that [`write`](Self::write) may write to `out`, before work that takes long.
+    ///
+    /// # Errors
+    /// Those of [`write`](Self::write) that can be known.
+    pub(crate) fn check_out(&self, out: &Path, force: bool) -> Result<()> {
+        let companions = self.companions(out, std::iter::empty())?;
+        CheckpointWriter::create(out, Vec::new(), &BTreeMap::new(), &companions, u64::MAX, force)?;
+        Ok(())
+    }
+
     /// Writes a checkpoint to the directory `out`: the `small` files by name and contents (`config.json` is one), the other files next to the
     /// source's weights, and the `planned` tensors, by calling `write` for each tensor that is kept.
     ///
@@ -145,16 +173,7 @@ impl SourceCheckpoint {
         progress: Progress<'_>,
         mut write: impl FnMut(&str, &mut CheckpointWriter) -> Result<()>,
     ) -> Result<Written> {
-        let files = self.checkpoint.files().chain(self.adapter.as_deref());
-        check_apart(&self.path, files, out)?;
-        let mut companions = Companions::of(&self.path, self.checkpoint.files())?;
-        if let Some(adapter) = &self.adapter {
-            let beside = is_beside(&self.path, adapter);
-            companions = companions.with_adapter(adapter, beside)?;
-        }
-        for (name, _) in small {
-            companions = companions.without(name);
-        }
+        let companions = self.companions(out, small.iter().map(|(name, _)| *name))?;
         let default = match self.checkpoint.files().count() {
             1 => u64::MAX,
             _ => MAX_SHARD_BYTES,

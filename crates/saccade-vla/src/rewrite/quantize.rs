@@ -15,6 +15,7 @@ use crate::nn::source::weight_view;
 use crate::ops::check_interrupted;
 use crate::precision::Precision;
 use crate::rewrite::float::Float;
+use crate::rewrite::rounding::RoundedWeights;
 use crate::rewrite::{RewriteOptions, SourceCheckpoint, Written};
 
 /// What [`quantize`] wrote.
@@ -24,6 +25,8 @@ pub struct QuantizeReport {
     pub written: Written,
     /// Weights that were quantised.
     pub num_quantized: usize,
+    /// How many of them were taken from [`RewriteOptions::rounded`].
+    pub num_calibrated: usize,
     /// Tensors copied bit for bit.
     pub num_copied: usize,
     /// Bytes of the head's tensors before.
@@ -45,6 +48,8 @@ pub struct QuantizeReport {
 /// `X.weight_scale (out)`. That is what [`Precision::Int8`] and [`Precision::Int4`] compute with, so that loading the result at that precision
 /// gives the same bits as loading `source` at it. So are the blocks of a backbone, if there is one that [`Backbone`](crate::Backbone) loads.
 /// All other tensors are copied bit for bit.
+///
+/// Weights in [`RewriteOptions::rounded`] are taken from there; [`round_layer`](crate::round_layer) writes such for the inputs of a layer.
 ///
 /// One tensor is in memory at a time. `progress(done, total)`, in bytes read, is called after each tensor; if it returns false, nothing is
 /// written.
@@ -70,26 +75,24 @@ pub fn quantize(
     mut progress: impl FnMut(u64, u64) -> bool,
 ) -> Result<QuantizeReport> {
     ensure!(to.quantizes(), Input, "to"; expected "'int8' or 'int4'"; got "'{to}'");
-    let source = SourceCheckpoint::open(source, options.config.as_deref())?;
-    let backbone = backbone_of(&source, options)?;
-    let head_specs = tensor_specs(&source.config)?;
-    let of_backbone = backbone.as_ref().ok().and_then(Option::as_ref);
-    let backbone_prefix = of_backbone.map(BackboneCheckpoint::prefix);
-    let mut weights = Names::default();
-    weights.add(source.prefix, &head_specs);
-    if let Some(backbone) = of_backbone {
-        weights.add(backbone.prefix(), backbone.specs());
+    ensure!(
+        to == Precision::Int4 || options.rounded.is_empty(), Input, "rounded";
+        expected "none with '{to}', since they have four bits"; got "{} layers", options.rounded.len()
+    );
+    let Quantizing {
+        source,
+        backbone,
+        weights,
+    } = Quantizing::open(source, options)?;
+    let rounded = RoundedWeights::open(&options.rounded)?;
+    if let Some(name) = rounded.names().find(|&name| !weights.quantized.contains(name)) {
+        bail!(Input, "rounded"; expected "weights that are quantised"; got "{name}");
     }
-    for name in &weights.quantized {
-        if let Ok(dtype) = source.checkpoint.dtype(name)
-            && is_quantized(dtype)
-        {
-            bail!(Checkpoint, "source"; "it is quantised already: {name} is {dtype:?}, expected F32, BF16 or F16");
-        }
-    }
+    let backbone_prefix = weights.backbone_prefix;
     let mut planned = Vec::new();
     let mut report = QuantizeReport {
-        backbone_copied: backbone.as_ref().err().cloned(),
+        num_calibrated: rounded.names().count(),
+        backbone_copied: backbone.err(),
         ..QuantizeReport::default()
     };
     for name in source.names(options) {
@@ -131,12 +134,70 @@ pub fn quantize(
         planned,
         &mut progress,
         |name, writer| match weights.quantized.contains(name) {
-            true => write_quantized(&source, name, to, writer),
+            true => write_quantized(&source, name, to, &rounded, writer),
             false if weights.all.contains(name) => copy_finite(&source.checkpoint, name, writer),
             false => source.copy(name, writer),
         },
     )?;
     Ok(report)
+}
+
+/// The weights that [`quantize`] rounds.
+#[derive(Clone, Debug)]
+pub struct QuantizedWeights {
+    /// What the names of the head's tensors begin with.
+    pub head_prefix: &'static str,
+    /// The same of the backbone's; none if there is none whose weights are quantised.
+    pub backbone_prefix: Option<&'static str>,
+    /// Their names, prefixes included.
+    pub names: BTreeSet<String>,
+}
+
+/// Which weights [`quantize`] would round, with the same arguments. Reads no tensor and leaves nothing.
+///
+/// # Errors
+/// Those of [`quantize`] that can be known so far, also of `out`.
+pub fn quantized_weights(source: &Path, out: &Path, options: &RewriteOptions) -> Result<QuantizedWeights> {
+    let Quantizing { source, weights, .. } = Quantizing::open(source, options)?;
+    source.check_out(out, options.force)?;
+    Ok(QuantizedWeights {
+        head_prefix: source.prefix,
+        backbone_prefix: weights.backbone_prefix,
+        names: weights.quantized,
+    })
+}
+
+/// A checkpoint whose weights are to be quantised.
+struct Quantizing {
+    source: SourceCheckpoint,
+    /// As [`backbone_of`] returns it.
+    backbone: std::result::Result<Option<BackboneCheckpoint>, String>,
+    weights: Names,
+}
+
+impl Quantizing {
+    fn open(source: &Path, options: &RewriteOptions) -> Result<Self> {
+        let source = SourceCheckpoint::open(source, options.config.as_deref())?;
+        let backbone = backbone_of(&source, options)?;
+        let mut weights = Names::default();
+        weights.add(source.prefix, &tensor_specs(&source.config)?);
+        if let Ok(Some(backbone)) = &backbone {
+            weights.add(backbone.prefix(), backbone.specs());
+            weights.backbone_prefix = Some(backbone.prefix());
+        }
+        for name in &weights.quantized {
+            if let Ok(dtype) = source.checkpoint.dtype(name)
+                && is_quantized(dtype)
+            {
+                bail!(Checkpoint, "source"; "it is quantised already: {name} is {dtype:?}, expected F32, BF16 or F16");
+            }
+        }
+        Ok(Self {
+            source,
+            backbone,
+            weights,
+        })
+    }
 }
 
 /// Tensors of models, by their names in the checkpoint.
@@ -145,6 +206,8 @@ struct Names {
     all: BTreeSet<String>,
     /// Those that may be stored as int8 or int4.
     quantized: BTreeSet<String>,
+    /// What the names of a backbone's begin with, if there is one that is quantised.
+    backbone_prefix: Option<&'static str>,
 }
 
 impl Names {
@@ -183,25 +246,33 @@ fn write_quantized(
     source: &SourceCheckpoint,
     name: &str,
     to: Precision,
+    rounded: &RoundedWeights,
     writer: &mut CheckpointWriter,
 ) -> Result<()> {
     let [out_features, in_features] = *source.shape(name) else {
         unreachable!("a linear layer's weight has two axes")
     };
     check_interrupted()?;
-    let weight = source.checkpoint.read(name)?;
-    let weight = weight_view(&weight, out_features, in_features);
-    let mut scales = filled("source", out_features, 0.0)?;
-    let bytes = if to == Precision::Int4 {
-        let mut values = filled("source", out_features * in_features.div_ceil(2), 0_u8)?;
-        quantize_rows_int4(weight, &mut values, &mut scales);
-        values
-    } else {
-        let mut values = filled("source", out_features * in_features, 0_i8)?;
-        quantize_rows(weight, &mut values, &mut scales);
-        bytemuck::cast_vec(values)
+    let (bytes, scales) = match rounded.read(name, &[out_features, in_features.div_ceil(2)])? {
+        Some(found) => found,
+        None => {
+            let weight = source.checkpoint.read(name)?;
+            let weight = weight_view(&weight, out_features, in_features);
+            let mut scales = filled("source", out_features, 0.0)?;
+            let bytes = if to == Precision::Int4 {
+                let mut values = filled("source", out_features * in_features.div_ceil(2), 0_u8)?;
+                quantize_rows_int4(weight, &mut values, &mut scales);
+                values
+            } else {
+                let mut values = filled("source", out_features * in_features, 0_i8)?;
+                quantize_rows(weight, &mut values, &mut scales);
+                bytemuck::cast_vec(values)
+            };
+            (bytes, scales)
+        }
     };
-    if let Some(row) = scales.iter().position(|scale| !(127.0 * scale).is_finite()) {
+    let most = if to == Precision::Int4 { 7.0 } else { 127.0 };
+    if let Some(row) = scales.iter().position(|scale| !(most * scale).is_finite()) {
         bail!(Checkpoint, "source"; "{name} holds NaN or infinity in row {row}, expected finite weights");
     }
     writer.tensor(name, &bytes)?;

@@ -26,12 +26,28 @@ const COLUMNS: usize = 128;
 pub struct Rounded {
     /// Whole numbers from -7 to 7, `(out_features, in_features)`.
     pub values: Vec<i8>,
-    /// The squared error of the layer's outputs, summed over rows and outputs, if each weight is rounded for itself.
-    pub plain_error: f64,
-    /// The same of [`values`](Self::values).
-    pub error: f64,
-    /// The sum of squares of the layer's outputs.
+    /// What they change.
+    pub errors: RoundingErrors,
+}
+
+/// How much rounded weights change the outputs of a linear layer, summed over rows and outputs. Each counts a hundredth of
+/// the squares of the inputs for themselves, as [`gptq`] does.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct RoundingErrors {
+    /// The squared error if each weight is rounded for itself.
+    pub plain: f64,
+    /// The squared error of the weights as they were rounded.
+    pub rounded: f64,
+    /// The squares of the outputs.
     pub outputs: f64,
+}
+
+impl RoundingErrors {
+    fn add(&mut self, other: Self) {
+        self.plain += other.plain;
+        self.rounded += other.rounded;
+        self.outputs += other.outputs;
+    }
 }
 
 /// Rounds `weight (out_features, in_features)` to multiples of `scales (out_features)` so that the outputs of the layer
@@ -44,15 +60,13 @@ pub struct Rounded {
 /// of docs/equations.md). A hundredth of each input's square is added to it, which makes any Gram matrix regular. A
 /// weight whose input was always zero keeps its nearest step, and so does a row of weights whose error is less so.
 ///
-/// The errors in the result, and what is compared, count that hundredth.
-///
 /// ```
 /// use saccade_vla::{Array, Gram, gptq};
 /// let mut gram = Gram::new(2)?;
 /// gram.add(Array::new(&[1.0, 1.0, -1.0, -1.0], &[2, 2])?, 1)?; // both inputs are the same
 /// let rounded = gptq(Array::new(&[1.4, 2.4], &[1, 2])?, &[1.0], &gram, 1)?;
 /// assert_eq!(rounded.values, [1, 3]); // their sum is what counts
-/// assert!(rounded.error < rounded.plain_error);
+/// assert!(rounded.errors.rounded < rounded.errors.plain);
 /// # Ok::<(), saccade_vla::Error>(())
 /// ```
 ///
@@ -83,7 +97,7 @@ pub fn gptq(weight: Array<'_>, scales: &[f32], gram: &Gram, threads: usize) -> R
         .chunks_mut(ROWS * in_features)
         .zip(weight.chunks(ROWS * in_features))
         .zip(scales.chunks(ROWS))
-        .map(|((values, weight), scales)| Mutex::new((values, weight, scales, Ok(Errors::default()))))
+        .map(|((values, weight), scales)| Mutex::new((values, weight, scales, Ok(RoundingErrors::default()))))
         .collect();
     parallel_for(threads, tasks.len(), &|task| {
         let mut task = tasks[task].try_lock().expect("each is one task");
@@ -91,22 +105,16 @@ pub fn gptq(weight: Array<'_>, scales: &[f32], gram: &Gram, threads: usize) -> R
         *errors = round(&factor, weight, scales, values);
     });
     check_interrupted()?;
-    let mut errors = Errors::default();
+    let mut errors = RoundingErrors::default();
     for task in tasks {
         let (.., of_task) = task.into_inner().expect("a task that panics ends the call");
         errors.add(of_task?);
     }
-    let Errors { plain, kept, outputs } = errors;
     ensure!(
-        (plain + kept + outputs).is_finite(), Input, "weight";
+        (errors.plain + errors.rounded + errors.outputs).is_finite(), Input, "weight";
         "outputs of the layer are too large: their squares overflow float64"
     );
-    Ok(Rounded {
-        values,
-        plain_error: plain,
-        error: kept,
-        outputs,
-    })
+    Ok(Rounded { values, errors })
 }
 
 fn check_scales(weight: &[f32], scales: &[f32], in_features: usize) -> Result<()> {
@@ -123,24 +131,8 @@ fn check_scales(weight: &[f32], scales: &[f32], in_features: usize) -> Result<()
     Ok(())
 }
 
-/// Squared errors of outputs, in sum.
-#[derive(Default)]
-struct Errors {
-    plain: f64,
-    kept: f64,
-    outputs: f64,
-}
-
-impl Errors {
-    fn add(&mut self, other: Self) {
-        self.plain += other.plain;
-        self.kept += other.kept;
-        self.outputs += other.outputs;
-    }
-}
-
 /// Rounds a few rows of weights.
-fn round(factor: &Factor, weight: &[f32], scales: &[f32], values: &mut [i8]) -> Result<Errors> {
+fn round(factor: &Factor, weight: &[f32], scales: &[f32], values: &mut [i8]) -> Result<RoundingErrors> {
     let width = factor.order.len();
     let mut sorted = filled(WHAT, weight.len(), 0.0_f64)?;
     for (sorted, weight) in sorted.chunks_exact_mut(width).zip(weight.chunks_exact(width)) {
@@ -154,7 +146,7 @@ fn round(factor: &Factor, weight: &[f32], scales: &[f32], values: &mut [i8]) -> 
     let plain = pass.run(|weight, _| weight)?;
     let plain_steps = pass.steps.clone();
     let fed = pass.run(|_, target| target)?;
-    let mut errors = Errors::default();
+    let mut errors = RoundingErrors::default();
     for (row, values) in values.chunks_exact_mut(width).enumerate() {
         let is_better = fed[row] < plain[row];
         let steps = if is_better { &pass.steps } else { &plain_steps };
@@ -162,7 +154,7 @@ fn round(factor: &Factor, weight: &[f32], scales: &[f32], values: &mut [i8]) -> 
             values[input] = step;
         }
         errors.plain += plain[row];
-        errors.kept += if is_better { fed[row] } else { plain[row] };
+        errors.rounded += if is_better { fed[row] } else { plain[row] };
         errors.outputs += outputs[row];
     }
     Ok(errors)

@@ -2,5 +2,8 @@
 
 mod factor;
 mod gptq;
+mod layer;
 
-pub use gptq::{Rounded, gptq};
+pub use gptq::{Rounded, RoundingErrors, gptq};
+pub(crate) use layer::RoundedWeights;
+pub use layer::{RoundedLayer, round_layer};
