@@ -7,14 +7,14 @@ import functools
 import logging
 import os
 import socket
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-import saccade
+from saccade._internal.environment import arithmetic
 from saccade.errors import InputError, SaccadeError
 from saccade_lab.extras import LAB
 from saccade_lab.parallel.files import Shipment, located, pack, place, relocated
@@ -34,12 +34,12 @@ class Job:
     Attributes:
         work: See ``saccade_lab.parallel.each``.
         shipments: Files and directories, by the absolute paths that ``work`` has for them.
-        version: The saccade that sends it.
+        arithmetic: What decides the bits of results where it is sent from.
     """
 
     work: Callable[[Any], Any]
     shipments: dict[str, Shipment]
-    version: str
+    arithmetic: dict[str, Any]
 
 
 def each(
@@ -60,7 +60,7 @@ def each(
         sources, work = located(work, files)
         shipments = {path: pack(source, ray.put) for path, source in sources.items()}
         # In a list, because Ray would replace the reference by the job, once for every item.
-        job = [ray.put(Job(work, shipments, saccade.__version__))]
+        job = [ray.put(Job(work, shipments, arithmetic()))]
         task = ray.remote(run_item).options(
             num_cpus=workers.num_threads, max_retries=RETRIES, scheduling_strategy="SPREAD"
         )
@@ -91,20 +91,41 @@ def received(reference: Any) -> Callable[[Any], Any]:
     """The work with the paths of this machine. It is kept for the next item.
 
     Raises:
-        InputError: This machine has another version of saccade.
+        InputError: This machine has another version of saccade, or other instructions.
         OSError: Files cannot be written.
     """
     import ray
 
     job: Job = ray.get(reference)
-    if job.version != saccade.__version__:
-        raise InputError(
-            f"saccade: expected version {job.version} on every machine of the cluster, got "
-            f"{saccade.__version__} on {os.uname().nodename}"
-        )
+    check_arithmetic(job.arithmetic)
     places = {path: place(shipment, ray.get) for path, shipment in job.shipments.items()}
     work: Callable[[Any], Any] = relocated(job.work, places)
     return work
+
+
+def check_arithmetic(expected: Mapping[str, Any]) -> None:
+    """Checks that this machine computes the bits of the one that sends the work.
+
+    Builds are not compared: machines that compile saccade themselves may each have another one.
+
+    Raises:
+        InputError: It has another version of saccade, or other instructions.
+    """
+    here, node = arithmetic(), os.uname().nodename
+    if expected["saccade"] != here["saccade"]:
+        raise InputError(
+            f"saccade: expected version {expected['saccade']} on every machine of the cluster, got "
+            f"{here['saccade']} on {node}"
+        )
+    wanted, got = (
+        f"{one['instruction_set']} with dot products {', '.join(one['dot_products']) or 'none'}"
+        for one in (expected, here)
+    )
+    if wanted != got:
+        raise InputError(
+            f"instructions: expected {wanted} on every machine of the cluster, as where the command runs, "
+            f"got {got} on {node}: set SACCADE_ISA on all of them, see docs/parallel.md"
+        )
 
 
 @contextlib.contextmanager

@@ -10,7 +10,7 @@ from typing import Any, Literal, overload
 import numpy as np
 
 import saccade._saccade as _saccade
-from saccade._internal.files import sha256_of
+from saccade._internal.files import remembered_sha256
 
 #: Other packages that a bug report should name, besides those of the extras.
 OTHERS = ("saccade-vla-lab", "lerobot-policy-saccade", "lerobot", "transformers", "mujoco")
@@ -54,7 +54,7 @@ def show_config(mode: Literal["stdout", "dicts"] = "stdout") -> dict[str, Any] |
     family, rates, tiles = _saccade.cpu_report()
     config = {
         "saccade": _saccade.__version__,
-        "library": sha256_of(Path(_saccade.__file__))[:12],
+        "library": library(),
         "cpu": cpu_name(),
         "isa": isa,
         "dot_products": _saccade.dot_products(),
@@ -78,6 +78,30 @@ def show_config(mode: Literal["stdout", "dicts"] = "stdout") -> dict[str, Any] |
         shown = (", ".join(value) if isinstance(value, list) else value) or "none"
         print(f"{name}: {shown}")
     return None
+
+
+def arithmetic() -> dict[str, Any]:
+    """What decides the bits of a result, besides its inputs and options.
+
+    Returns:
+        ``saccade``: the version; ``library``: the build, as :func:`show_config` names it;
+        ``instruction_set``; and ``dot_products``: those that it uses on this CPU, which are not the same on
+        every CPU that has the instruction set. float32 uses none of them.
+
+    Raises:
+        InputError: ``SACCADE_ISA`` has a value that cannot be used here.
+    """
+    return {
+        "saccade": _saccade.__version__,
+        "library": library(),
+        "instruction_set": _saccade.selected_isa(),
+        "dot_products": _saccade.dot_products(),
+    }
+
+
+def library() -> str:
+    """The beginning of the SHA-256 of the compiled library, which tells builds apart."""
+    return remembered_sha256(Path(_saccade.__file__))[:12]
 
 
 def usable_processors() -> int:

@@ -1,7 +1,9 @@
 """Files: written so that a reader never sees half of one, and hashed."""
 
+import functools
 import hashlib
 import os
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -37,6 +39,28 @@ def write_json(path: Path, value: Any) -> None:
     """Writes indented JSON with a final newline; numbers that are not finite become ``null``."""
     with write_atomically(path) as temporary:
         temporary.write_text(dumps(value, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
+
+
+#: Seconds after a change in which another one may leave a file the same times; two on FAT.
+UNSETTLED = 2.0
+
+
+def remembered_sha256(path: Path) -> str:
+    """SHA-256 of a file. It is read again only if it has changed since this process read it.
+
+    Size, times and inode tell whether it has. A file that changed in the last seconds is always read.
+    """
+    about = path.stat()
+    if time.time() - max(about.st_mtime, about.st_ctime) < UNSETTLED:
+        return sha256_of(path)
+    return _sha256_of_state(
+        path, about.st_dev, about.st_ino, about.st_size, about.st_mtime_ns, about.st_ctime_ns
+    )
+
+
+@functools.cache
+def _sha256_of_state(path: Path, *state: int) -> str:
+    return sha256_of(path)
 
 
 def sha256_of(*paths: Path) -> str:

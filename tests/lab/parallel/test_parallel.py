@@ -12,9 +12,11 @@ import numpy as np
 import pytest
 
 from saccade._internal.arrays import UInt8Array
+from saccade._internal.environment import arithmetic
 from saccade.errors import InputError
 from saccade_lab.files import path_text
 from saccade_lab.parallel import ALONE, Lost, Workers, each, files
+from saccade_lab.parallel.cluster import check_arithmetic
 from tests.helpers.parallel_cases import Square
 
 TWO = Workers(jobs=2)
@@ -29,6 +31,29 @@ def test_linked_directories_travel_and_circles_end(tmp_path: Path) -> None:
     (tmp_path / "shared" / "again").symlink_to("../shared")
     found = files.files_of(tmp_path / "policy")
     assert sorted(found) == ["policy/config.json", "policy/experiment_cfg/metadata.json"]
+
+
+def test_a_machine_that_computes_other_bits_is_refused() -> None:
+    here = arithmetic()
+    check_arithmetic(here)
+    check_arithmetic({**here, "library": "another build"})
+    own = f"{here['instruction_set']} with dot products"
+    for name, value, message in (
+        (
+            "saccade",
+            "0.0.1",
+            f"saccade: expected version 0.0.1 on every machine of the cluster, got {here['saccade']}",
+        ),
+        ("instruction_set", "sse9", "instructions: expected sse9 with dot products "),
+        ("dot_products", [], f"instructions: expected {own} none on every machine of the cluster"),
+        ("dot_products", ["vnni9"], f"instructions: expected {own} vnni9 on every machine of the cluster"),
+    ):
+        if here[name] == value:
+            continue
+        with pytest.raises(InputError) as error:
+            check_arithmetic({**here, name: value})
+        assert str(error.value).startswith(message)
+        assert os.uname().nodename in str(error.value)
 
 
 class Unreadable:

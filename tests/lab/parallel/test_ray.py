@@ -27,6 +27,7 @@ from saccade.evaluation.source import weights_hash
 from saccade_lab.cli import rollout
 from saccade_lab.libero.episodes import Episodes
 from saccade_lab.parallel import ALONE, Lost, Workers, each
+from saccade_lab.parallel import cluster as cluster_module
 from saccade_lab.recordings.spreading import spread
 from saccade_lab.sim import demos, graphics
 from saccade_lab.sim.policy import DEMO_CHECKPOINT
@@ -258,11 +259,24 @@ class Dies:
         os._exit(9)
 
 
-def test_another_version_on_a_machine_is_named(
-    nodes: TwoNodes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("saccade", "0.0.1", r"saccade: expected version 0\.0\.1 on every machine"),
+        ("dot_products", ["bf15"], r"instructions: expected .* with dot products bf15 on every machine"),
+    ],
+)
+def test_a_machine_that_computes_other_bits_is_named(
+    name: str,
+    value: Any,
+    message: str,
+    nodes: TwoNodes,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(saccade, "__version__", "0.0.1")
-    with pytest.raises(InputError, match=r"saccade: expected version 0\.0\.1 on every machine"):
+    expected = {**cluster_module.arithmetic(), name: value}
+    monkeypatch.setattr(cluster_module, "arithmetic", lambda: expected)
+    with pytest.raises(InputError, match=message):
         list(each(Square(tmp_path / "log"), [1], nodes.workers))
 
 
