@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from saccade._internal.arrays import Float32Array, UInt8Array, integer
-from saccade._internal.files import sha256_of
+from saccade._internal.files import remembered_sha256
 from saccade.datasets import forms
 from saccade.datasets.features import Episode
 from saccade.datasets.modality import ANNOTATION, TASK, Columns, Modality, plain
@@ -316,7 +316,7 @@ class Dataset:
             names |= {one.file, *(part.file for part in one.videos.values())}
         digest = hashlib.sha256()
         for name in sorted(names):
-            digest.update(f"{name}\0{sha256_of(self.root / name)}\n".encode())
+            digest.update(f"{name}\0{remembered_sha256(self.root / name)}\n".encode())
         return digest.hexdigest()
 
     def _observation(self, episode: int, step: int, form: str) -> dict[str, Any]:

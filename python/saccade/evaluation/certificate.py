@@ -14,14 +14,15 @@ from typing import Any
 import numpy as np
 
 from saccade._internal.arrays import Float32Array
-from saccade._internal.environment import show_config
+from saccade._internal.environment import arithmetic, cpu_name
 from saccade.errors import InputError
 from saccade.evaluation.prediction import noise_of
 from saccade.evaluation.recordings import Recordings, length_of, observation_at
-from saccade.evaluation.source import Source, forget_policy
+from saccade.evaluation.source import Source, forget_policy, named
 from saccade.policy.policy import Policy
+from saccade.robots import Normalizer
 
-FORMAT = 1
+FORMAT = 2
 MOST = 16  # observations in a certificate, evenly spaced
 #: What a certificate may say of loading and of sampling.
 OPTIONS = (
@@ -29,7 +30,11 @@ OPTIONS = (
     "precision",
 )
 SAMPLING = ("num_steps", "integrator", "future_refresh")
-TOLERANCE = 1e-3  # of normalised actions on another instruction set, or twice the precision's own difference
+#: Options whose files may be read besides the checkpoint.
+OPTION_FILES = ("tokenizer", "data_config")
+TOLERANCE = 1e-3  # of normalised actions elsewhere, or twice the precision's own difference
+#: Where these are equal, the actions must have the same bits. Dot products matter to other precisions.
+EXACT, ROUNDED = ("saccade", "library", "instruction_set"), ("dot_products",)
 
 
 @dataclass(frozen=True)
@@ -37,17 +42,20 @@ class Certificate:
     """What was computed, with what, and how much depends on how.
 
     Attributes:
-        checkpoint, recordings: ``name``, ``path`` and ``sha256`` of each.
-        options: How the checkpoint was loaded.
+        checkpoint, recordings: ``name``, ``path`` and ``sha256`` of each. The path is absolute, or the id and
+            commit of a published one.
+        options: How the checkpoint was loaded, with absolute paths.
+        option_files: SHA-256 of the tokenizer and of the data config, if they are not the checkpoint's.
         stride, seed, sampling: As of :func:`saccade.evaluate`.
         observations: ``[episode, step]`` of each observation.
-        made_with: ``saccade``, ``instruction_set``, ``cpu``, ``num_threads``.
+        made_with: ``saccade``, ``library`` (the build), ``instruction_set``, ``dot_products``, ``cpu``,
+            ``num_threads``.
         actions: The actions, in base64: float32, little-endian, ``(observations, horizon, width)`` in the
             robot's units.
         actions_sha256: Hash of their bytes.
-        from_float32: Largest absolute difference from saccade in float32: ``normalized``, and ``by_key`` in
-            the robot's units. Zero for float32.
-        equal_over_batches: Whether each observation has the same bits alone and in a batch.
+        from_float32: Largest absolute difference from saccade in float32: ``normalized``, which is not
+            clipped, and ``by_key`` in the robot's units. Zero for float32.
+        equal_over_batches: Whether each observation has the same bits alone and in a batch of several.
         equal_over_threads: Whether the actions have the same bits with the numbers of ``threads``.
         threads: These numbers.
     """
@@ -55,6 +63,7 @@ class Certificate:
     checkpoint: Mapping[str, str]
     recordings: Mapping[str, str]
     options: Mapping[str, Any]
+    option_files: Mapping[str, str]
     stride: int
     seed: int
     sampling: Mapping[str, Any]
@@ -101,27 +110,35 @@ class Certificate:
         Raises:
             KeyError, TypeError, ValueError: Something is missing or of another type.
         """
+        for name in ("checkpoint", "recordings", "options", "option_files", "sampling", "made_with"):
+            if not isinstance(getattr(self, name), dict):
+                raise TypeError(f"{name}: expected an object")
         for part in (self.checkpoint, self.recordings):
             if not all(isinstance(part[name], str) for name in ("name", "path", "sha256")):
                 raise TypeError("checkpoint, recordings: expected texts")
-        base64.b64decode(self.actions, validate=True)
+        if self.actions_sha256 != _sha256(base64.b64decode(self.actions, validate=True)):
+            raise ValueError("actions_sha256: expected that of the actions")
         equal: list[Any] = [self.equal_over_batches, self.equal_over_threads]
         if any(type(one) is not bool for one in equal):
             raise TypeError("equal_over_batches, equal_over_threads: expected true or false")
-        for name, given, known in (("options", self.options, OPTIONS), ("sampling", self.sampling, SAMPLING)):
-            if any(key not in known for key in dict(given)):
+        for name, known in (("options", OPTIONS), ("option_files", OPTION_FILES), ("sampling", SAMPLING)):
+            given = getattr(self, name)
+            if any(key not in known for key in given):
                 raise ValueError(f"{name}: expected {', '.join(known)}, got {given!r:.100}")
+        if not all(isinstance(value, str) for value in self.option_files.values()):
+            raise TypeError("option_files: expected texts")
         numbers = [self.stride, self.seed, *(number for place in self.observations for number in place)]
-        if any(type(number) is not int for number in numbers) or any(
+        if any(type(number) is not int for number in (*numbers, *self.threads)) or any(
             len(place) != 2 for place in self.observations
         ):
-            raise TypeError("stride, seed, observations: expected integers")
-        if min(numbers, default=0) < 0 or not 1 <= len(self.observations) <= MOST:
+            raise TypeError("stride, seed, observations, threads: expected integers")
+        if min(numbers) < 0 or not 1 <= len(self.observations) <= MOST:
             raise ValueError(f"seed, observations: expected 1 to {MOST} observations, and no negative number")
-        # What another machine may differ by follows from it.
-        if not 0 <= float(self.from_float32["normalized"]) < math.inf:
-            raise ValueError("from_float32: normalized: expected a finite number of at least 0")
-        dict(self.made_with)
+        if len(set(self.threads)) != 2 or min(self.threads) < 1:
+            raise ValueError(f"threads: expected two numbers of at least 1, got {self.threads!r:.100}")
+        for number in (self.from_float32["normalized"], *self.from_float32["by_key"].values()):
+            if not 0 <= float(number) < math.inf:
+                raise ValueError("from_float32: expected finite numbers of at least 0")
 
 
 @dataclass(frozen=True)
@@ -152,49 +169,58 @@ def certify(
 def check(certificate: Certificate, source: Source) -> list[Finding]:
     """Computes what a certificate says, and compares.
 
-    On the instruction set and version of the certificate, the actions must have its bits. Elsewhere the
-    normalised actions may differ by 0.001, or by twice what the precision differs from float32.
+    With the version, build, instruction set and dot products of the certificate, the actions must have its
+    bits; in float32 whatever the dot products are. Elsewhere the normalised actions may differ by 0.001, or
+    by twice what the precision differs from float32, on the machine where it differs less.
 
     Raises:
         SaccadeError: As :func:`saccade.evaluate`.
     """
-    found = []
     identity = source.identity()
-    for part in ("checkpoint", "recordings"):
-        expected, got = getattr(certificate, part)["sha256"], identity[part]["sha256"]
-        found.append(Finding(f"{part}, sha256", expected[:16], got[:16], expected == got))
+    found = [
+        _equal(f"{part}, sha256", getattr(certificate, part)["sha256"], identity[part]["sha256"])
+        for part in ("checkpoint", "recordings")
+    ]
+    files = [certificate.option_files, identity["option_files"]]
+    found += [
+        _equal(f"{name}, sha256", *(one.get(name, "the checkpoint's") for one in files))
+        for name in OPTION_FILES
+        if any(name in one for one in files)
+    ]
     if not all(one.holds for one in found):
         return found
     here = _certified(
         source, certificate.observations, certificate.stride, certificate.seed, certificate.sampling
     )
-    same = [
-        certificate.made_with.get(name) == here.made_with[name] for name in ("saccade", "instruction_set")
+    differences = [float(one.from_float32["normalized"]) for one in (certificate, here)]
+    # What the certificate says of itself must not widen what it may differ by.
+    most = max(TOLERANCE, 2 * min(differences))
+    other = [
+        f"{name} {_shown(certificate.made_with.get(name))}"
+        for name in (EXACT if _is_float32(certificate.options) else EXACT + ROUNDED)
+        if certificate.made_with.get(name) != here.made_with[name]
     ]
-    if all(same):
-        holds = certificate.actions == here.actions
-        found.append(
-            Finding("actions, bits", certificate.actions_sha256[:16], here.actions_sha256[:16], holds)
-        )
+    if not other:
+        found.append(_equal("actions, bits", certificate.actions_sha256, here.actions_sha256))
     else:
         apart = _largest_normalized(source, certificate, here)
-        most = max(TOLERANCE, 2 * float(certificate.from_float32["normalized"]))
-        elsewhere = " ".join(str(certificate.made_with.get(name)) for name in ("saccade", "instruction_set"))
-        found.append(
-            Finding(
-                f"actions, normalised, of {elsewhere}", f"at most {most:.3g}", f"{apart:.3g}", apart <= most
-            )
-        )
+        name = f"actions, normalised, made with {', '.join(other)}"
+        found.append(Finding(name, f"at most {most:.3g} apart", f"{apart:.3g}", apart <= most))
     for name, label in (("equal_over_batches", "batches"), ("equal_over_threads", "threads")):
         expected, got = getattr(certificate, name), getattr(here, name)
         found.append(Finding(f"the same bits over {label}", str(expected), str(got), got and expected))
-    limit, got = (float(one.from_float32["normalized"]) for one in (certificate, here))
-    found.append(
-        Finding(
-            "largest difference from float32", f"{limit:.3g}", f"{got:.3g}", got <= max(TOLERANCE, 2 * limit)
-        )
-    )
+    certified, got = (f"{one:.3g}" for one in differences)
+    found.append(Finding("largest difference from float32", certified, got, max(differences) <= most))
     return found
+
+
+def _shown(value: Any) -> str:
+    return ", ".join(map(str, value)) or "none" if isinstance(value, list) else str(value)
+
+
+def _equal(name: str, certified: str, found: str) -> Finding:
+    """A finding that two hashes are equal."""
+    return Finding(name, certified[:16], found[:16], certified == found)
 
 
 def _spread(data: Recordings, episodes: Sequence[int], stride: int) -> list[tuple[int, int]]:
@@ -212,8 +238,11 @@ def _certified(
     sampling: Mapping[str, Any],
 ) -> Certificate:
     policy, data = source.policy, source.data
-    together = _actions(policy, data, places, seed, sampling)
-    alone = np.concatenate([_actions(policy, data, [place], seed, sampling) for place in places])
+    # A single observation is in a batch with itself.
+    batch = list(places) if len(places) > 1 else [*places, *places]
+    batched = _actions(policy, data, batch, seed, sampling)
+    alone = np.concatenate([_actions(policy, data, [place], seed, sampling) for place in batch])
+    together = batched[: len(places)]
     used = policy.head.num_threads
     other = 1 if used > 1 else 2
     keys, normalizer = policy.normalizer.action_slices, policy.normalizer
@@ -224,40 +253,44 @@ def _certified(
     rethreaded = replace(source, options={**options, "num_threads": other})
     threaded = _actions(rethreaded.policy, data, places, seed, sampling)
     forget_policy()
-    precisions = options.get("precision", "float32")
-    names = set(precisions.values()) if isinstance(precisions, Mapping) else {precisions}
     exact = together
-    if names != {"float32"}:
+    if not _is_float32(options):
         plain = replace(source, options={**options, "precision": "float32"})
         exact = _actions(plain.policy, data, places, seed, sampling)
         forget_policy()
     apart = np.abs(together.astype(np.float64) - exact)
-    scaled = [np.asarray(normalizer.normalize_actions(one, state), np.float64) for one in (together, exact)]
-    about, config = source.identity(), show_config("dicts")
+    about, anywhere = named(source.identity(), source.names()), source.from_anywhere()
+    stored = together.astype("<f4").tobytes()
     return Certificate(
-        checkpoint={**about["checkpoint"], "path": source.checkpoint},
-        recordings={**about["recordings"], "path": source.recordings},
-        options={name: value for name, value in options.items() if name != "num_threads"},
+        checkpoint={**about["checkpoint"], "path": anywhere.checkpoint},
+        recordings={**about["recordings"], "path": anywhere.recordings},
+        options={name: value for name, value in anywhere.options.items() if name != "num_threads"},
+        option_files=about["option_files"],
         stride=stride,
         seed=seed,
         sampling=dict(sampling),
         observations=[[int(one) for one in place] for place in places],
-        made_with={
-            "saccade": config["saccade"],
-            "instruction_set": config["isa"],
-            "cpu": config["cpu"],
-            "num_threads": used,
-        },
-        actions=base64.b64encode(together.astype("<f4").tobytes()).decode("ascii"),
-        actions_sha256=hashlib.sha256(together.astype("<f4").tobytes()).hexdigest(),
+        made_with={**arithmetic(), "cpu": cpu_name(), "num_threads": used},
+        actions=base64.b64encode(stored).decode("ascii"),
+        actions_sha256=_sha256(stored),
         from_float32={
-            "normalized": float(np.abs(scaled[0] - scaled[1]).max()),
+            "normalized": _apart(normalizer, state, together, exact),
             "by_key": {key: float(apart[..., where].max()) for key, where in keys.items()},
         },
-        equal_over_batches=together.tobytes() == alone.tobytes(),
+        equal_over_batches=batched.tobytes() == alone.tobytes(),
         equal_over_threads=together.tobytes() == threaded.tobytes(),
         threads=sorted((used, other)),
     )
+
+
+def _is_float32(options: Mapping[str, Any]) -> bool:
+    """Whether backbone and head compute in float32."""
+    precision = options.get("precision", "float32")
+    return set(precision.values() if isinstance(precision, Mapping) else [precision]) == {"float32"}
+
+
+def _sha256(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()
 
 
 def _actions(
@@ -287,11 +320,14 @@ def _largest_normalized(source: Source, certificate: Certificate, here: Certific
     first, second = (np.frombuffer(one, "<f4") for one in held)
     if not np.isfinite(first).all():
         return float("inf")
-    normalizer = source.policy.normalizer
-    state = _states(source.policy, source.data, certificate.observations)
-    shape = (len(certificate.observations), -1, normalizer.action_width)
-    scaled = [
-        np.asarray(normalizer.normalize_actions(one.reshape(shape).astype(np.float32), state), np.float64)
-        for one in (first, second)
-    ]
+    policy = source.policy
+    shape = (len(certificate.observations), -1, policy.normalizer.action_width)
+    state = _states(policy, source.data, certificate.observations)
+    one, other = (values.reshape(shape).astype(np.float32) for values in (first, second))
+    return _apart(policy.normalizer, state, one, other)
+
+
+def _apart(normalizer: Normalizer, state: Float32Array, one: Float32Array, other: Float32Array) -> float:
+    """The largest difference of actions as the head sees them, without clipping, which would hide some."""
+    scaled = [np.asarray(normalizer.previous_chunk(each, state), np.float64) for each in (one, other)]
     return float(np.abs(scaled[0] - scaled[1]).max())

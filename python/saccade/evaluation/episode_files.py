@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any, Generic, TypeVar
@@ -11,11 +11,13 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 
 from saccade._internal import run_settings
-from saccade._internal.files import write_atomically
+from saccade._internal.files import write_atomically, write_json
+from saccade._internal.small_files import read_json
 from saccade.errors import InputError
 
 Record = TypeVar("Record")
 SETTINGS = "settings.json"
+NAMES = "names.json"
 
 
 class EpisodeFiles(Generic[Record]):
@@ -24,12 +26,16 @@ class EpisodeFiles(Generic[Record]):
     Args:
         folder: DIR.
         kind: The dataclass.
+        check: Raises ``ValueError`` for a record that is not one of this run.
     """
 
-    def __init__(self, folder: Path, kind: type[Record]) -> None:
+    def __init__(
+        self, folder: Path, kind: type[Record], check: Callable[[Record], None] | None = None
+    ) -> None:
         assert is_dataclass(kind)
         self.folder = folder / "episodes"
         self.kind = kind
+        self.check = check
 
     def begin(self, settings: Mapping[str, Any]) -> None:
         """Writes the settings of a run, or checks that the directory has results of the same settings.
@@ -60,6 +66,22 @@ class EpisodeFiles(Generic[Record]):
             raise FileNotFoundError(f"{file}: no such file; expected the directory of an earlier run")
         return run_settings.read(file)
 
+    def write_names(self, names: Mapping[str, str]) -> None:
+        """Keeps what readers call the checkpoint and the recordings, which may change between two runs."""
+        write_json(self.folder / NAMES, names)
+
+    def names(self) -> dict[str, str]:
+        """What readers call them; empty if that was not kept.
+
+        Raises:
+            CheckpointError, InputError: The file is damaged.
+        """
+        file = self.folder / NAMES
+        found = read_json(file) if file.is_file() else {}
+        if not all(isinstance(name, str) for name in found.values()):
+            raise InputError(f"{file}: expected an object of texts, got {found!r:.60}")
+        return found
+
     def path(self, episode: int) -> Path:
         """The file of an episode."""
         return self.folder / f"{episode:06d}.npz"
@@ -87,6 +109,8 @@ class EpisodeFiles(Generic[Record]):
             )
             if found.episode != episode:  # type: ignore[attr-defined]
                 raise ValueError(f"it is of episode {found.episode}")  # type: ignore[attr-defined]
+            if self.check is not None:
+                self.check(found)
             return found
         except (OSError, ValueError, TypeError, EOFError, zipfile.BadZipFile) as error:
             raise InputError(f"{path}: cannot be read: {error}; delete it to compute it again") from None
