@@ -3,44 +3,22 @@
 from __future__ import annotations
 
 import csv
-import gc
 import json
 import shutil
-import weakref
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 import saccade
-from saccade import cli
+from saccade._internal.environment import arithmetic
 from saccade.cli import recorded
-from saccade.evaluation.source import forget_policy, weights_hash
-from tests.helpers.recorded_cases import Recorded, by_the_policy, demo_policy
-from tests.helpers.recorded_folder import written
+from saccade.evaluation import Evaluation, source
+from saccade.evaluation.source import weights_hash
+from tests.helpers.recorded_cases import Recorded, demo_policy
+from tests.helpers.recorded_commands import DEMO, results, run
 
-LENGTHS = (9, 5, 8)
-DEMO = str(saccade.demo_checkpoint())
-
-
-@pytest.fixture(scope="module")
-def data() -> Recorded:
-    return by_the_policy(demo_policy(), LENGTHS, stride=4, seed=0)
-
-
-@pytest.fixture(scope="module")
-def folder(data: Recorded, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return written(data, tmp_path_factory.mktemp("recordings") / "tiny")
-
-
-@pytest.fixture(autouse=True)
-def without_pages(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The lab has tests of its own."""
-    monkeypatch.setattr(recorded, "extension", lambda name: None)
-
-
-def run(*arguments: Any) -> int:
-    return cli.main([str(argument) for argument in arguments])
+pytestmark = pytest.mark.usefixtures("without_pages")
 
 
 def test_the_results_are_those_of_the_function(
@@ -79,8 +57,7 @@ def test_an_interrupted_run_goes_on(folder: Path, tmp_path: Path, capsys: pytest
     assert run("evaluate", DEMO, folder, "--out", out, *options) == 0
     assert all(path.stat().st_mtime_ns == time for path, time in files.items())
     assert run("evaluate", DEMO, folder, "--out", whole, *options) == 0
-    first, second = (json.loads((one / "results.json").read_text()) for one in (out, whole))
-    assert {**first, "seconds": 0} == {**second, "seconds": 0}
+    assert results(out) == results(whole)
     capsys.readouterr()
     assert run("evaluate", DEMO, folder, "--out", out, "--stride", 4, "--seed", 5) == 2
     assert "other settings (stride, seed changed)" in capsys.readouterr().err
@@ -147,102 +124,91 @@ def test_results_are_not_mixed(folder: Path, tmp_path: Path, capsys: pytest.Capt
     assert "settings.json: no such file, but results of episodes beside it" in capsys.readouterr().err
 
 
-def test_the_hash_of_a_checkpoint_tells_where_its_files_are(tmp_path: Path) -> None:
-    for folder, name in (("one", "a"), ("two", "b")):
-        (tmp_path / folder / name).mkdir(parents=True)
-        (tmp_path / folder / name / "merges.txt").write_text("x")
-    first, second = (weights_hash(tmp_path / name) for name in ("one", "two"))
-    assert first != second
-    (tmp_path / "one" / "a" / "merges.txt").write_text("y")
-    assert weights_hash(tmp_path / "one") != first
-
-
-def test_a_certificate_holds_here_and_notices_changes(
+def test_other_files_are_the_same_by_any_name(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    file = tmp_path / "certificate.json"
-    options = ("--stride", 8, "--num-threads", 1, "--precision", "int8")
-    assert run("evaluate", DEMO, folder, "--out", tmp_path / "out", *options, "--certify", file) == 0
-    values = json.loads(file.read_text())
-    assert values["equal_over_batches"] is values["equal_over_threads"] is True
-    assert values["threads"] == [1, 2]
-    assert 0 < values["from_float32"]["normalized"] < 1
-    assert values["observations"] == [[0, 0], [0, 8], [1, 0], [2, 0]]
-    assert file.stat().st_size < 20_000
+    out, old, new = tmp_path / "out", tmp_path / "old", tmp_path / "new"
+    for name, origin in (("policy", DEMO), ("recordings", folder)):
+        shutil.copytree(origin, old / name)
+    shutil.copyfile(Path(DEMO) / "tokenizer.json", old / "words.json")
+
+    def command(root: Path, suffix: str = "") -> tuple[Any, ...]:
+        given = (
+            root / f"policy{suffix}",
+            root / f"recordings{suffix}",
+            "--tokenizer",
+            root / f"words{suffix}.json",
+        )
+        return ("evaluate", *given, "--out", out, "--stride", 16, "--num-threads", 1)
+
+    assert run(*command(old)) == 0
+    before = results(out)
+    assert (before["checkpoint"]["name"], before["recordings"]["name"]) == ("policy", "recordings")
+    files = {path: path.stat().st_mtime_ns for path in (out / "episodes").glob("*.npz")}
+    new.mkdir()
+    for name, suffix in (("policy", ""), ("recordings", ""), ("words", ".json")):
+        (old / f"{name}{suffix}").rename(new / f"{name}-2{suffix}")
+    assert run(*command(new, "-2")) == 0
+    assert all(path.stat().st_mtime_ns == time for path, time in files.items())
+    after = results(out)
+    assert (after.pop("checkpoint")["name"], after.pop("recordings")["name"]) == ("policy-2", "recordings-2")
+    assert after == {name: value for name, value in before.items() if name in after}
     capsys.readouterr()
-    assert run("certify", file, "--json", "--num-threads", 2) == 0
-    found = json.loads(capsys.readouterr().out)
-    assert found["holds"] is True
-    assert [one["name"] for one in found["findings"]] == [
-        "checkpoint, sha256",
-        "recordings, sha256",
-        "actions, bits",
-        "the same bits over batches",
-        "the same bits over threads",
-        "largest difference from float32",
-    ]
-    # Other bits of the same machine; other machines may round otherwise, but not compute something else.
-    forged = {**values, "actions": values["actions"][:-8] + "AAAAAAA="}
-    file.write_text(json.dumps(forged))
-    assert run("certify", file) == 1
-    assert "NO" in capsys.readouterr().out
-    elsewhere = {**values, "made_with": {**values["made_with"], "instruction_set": "elsewhere"}}
-    file.write_text(json.dumps(elsewhere))
-    assert run("certify", file) == 0
-    wrong = {**elsewhere, "actions": "AAAA" * (len(values["actions"]) // 4)}
-    file.write_text(json.dumps(wrong))
-    assert run("certify", file) == 1
-    capsys.readouterr()
-    for wrong in (
-        {"sampling": {"speed": 2}},
-        {"observations": [[0]]},
-        {"observations": []},
-        {"observations": [[0, 0]] * 17},
-        {"observations": [[0, -1]]},
-        {"seed": -1},
-        {"stride": 1.5},
-        {"checkpoint": {}},
-        {"equal_over_batches": "yes"},
-        {"from_float32": {"normalized": 1e999}},
-        {"from_float32": {"normalized": -1}},
-        {"from_float32": {"normalized": None}},
-    ):
-        file.write_text(json.dumps({**values, **wrong}))
-        assert run("certify", file) == 2
-    other = {**values, "recordings": {**values["recordings"], "sha256": "0" * 64}}
-    file.write_text(json.dumps(other))
-    assert run("certify", file, "--json") == 1
-    assert [one["holds"] for one in json.loads(capsys.readouterr().out)["findings"]] == [True, False]
+    (new / "words-2.json").write_text((new / "words-2.json").read_text() + "\n")
+    assert run(*command(new, "-2")) == 2
+    assert "other settings (option_files changed)" in capsys.readouterr().err
 
 
-def test_a_certificate_has_one_policy_in_memory(
-    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("name", ["saccade", "library", "instruction_set", "dot_products"])
+def test_what_computes_does_not_change_within_a_run(
+    name: str,
+    folder: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
-    load, most = saccade.Policy.from_pretrained, []
-    loaded: list[weakref.ref[saccade.Policy]] = []
-
-    def counted(*arguments: Any, **options: Any) -> saccade.Policy:
-        gc.collect()
-        most.append(sum(one() is not None for one in loaded))
-        policy = load(*arguments, **options)
-        loaded.append(weakref.ref(policy))
-        return policy
-
-    forget_policy()
-    monkeypatch.setattr(saccade.Policy, "from_pretrained", counted)
-    options = ("--stride", 8, "--num-threads", 1, "--precision", "int8")
-    file = tmp_path / "certificate.json"
-    assert run("evaluate", DEMO, folder, "--out", tmp_path / "out", *options, "--certify", file) == 0
-    assert most == [0, 0, 0]  # with these options, with other threads, in float32
+    command = ("evaluate", DEMO, folder, "--out", tmp_path, "--stride", 16, "--num-threads", 1)
+    assert run(*command, "--episodes", 1) == 0
+    here = arithmetic()
+    assert results(tmp_path)[name] == here[name]
+    monkeypatch.setattr(source, "arithmetic", lambda: {**here, name: "other"})
+    assert run(*command) == 2
+    assert f"other settings ({name} changed)" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("text", ["", "[]", "{}", '{"format": 2}', '{"format": 1, "mse": 3}', "null", "3"])
-def test_no_certificate_is_named(text: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    file = tmp_path / "certificate.json"
-    file.write_text(text)
-    assert run("certify", file) == 2
-    assert "expected a certificate" in capsys.readouterr().err
-    assert run("certify", tmp_path / "none.json") == 2
+def test_results_may_be_in_the_checkpoints_folder(folder: Path, tmp_path: Path) -> None:
+    checkpoint = tmp_path / "policy"
+    shutil.copytree(DEMO, checkpoint)
+    before = weights_hash(checkpoint)
+    for out in (checkpoint, checkpoint / "evaluation"):
+        command = ("evaluate", checkpoint, folder, "--out", out, "--stride", 16, "--num-threads", 1)
+        assert run(*command, "--episodes", 1) == 0
+        assert run(*command) == 0
+    shutil.copytree(DEMO, checkpoint / "checkpoint-500")  # what a trainer leaves
+    assert weights_hash(checkpoint) == before
+
+
+def test_an_older_page_does_not_stay(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    command = ("evaluate", DEMO, folder, "--out", tmp_path, "--stride", 16, "--num-threads", 1)
+    curves = tmp_path / "curves"
+    curves.mkdir()
+    page, old, note = tmp_path / "index.html", curves / "000002.png", curves / "note.txt"
+    for path in (page, old, note):
+        path.write_text("old")
+    assert run(*command, "--episodes", 1) == 0
+    assert [path.exists() for path in (page, old, note)] == [False, False, True]
+    drawn = []
+
+    def draw(report: Evaluation, about: dict[str, Any], out: Path) -> None:
+        drawn.append([one.episode for one in report.predictions])
+        assert not page.exists()
+        page.write_text(about["checkpoint"]["name"])
+
+    monkeypatch.setattr(recorded, "extension", lambda name: draw)
+    for episodes in ("0,1", "1"):
+        assert run(*command, "--episodes", episodes) == 0
+    assert drawn == [[0, 1], [1]]
+    assert page.read_text() == "demo"
 
 
 def test_a_diagnosis_is_that_of_the_function(
@@ -288,6 +254,10 @@ def test_what_does_not_fit_is_one_line(
         (("--jobs", 0), "--jobs: given 0, expected at least 1, or -1 for one per core"),
         (("--address", "first:6379"), "--address: only with --backend ray, given loky"),
         (("--certify", tmp_path), f"--certify: expected the name of a file, got the directory {tmp_path}"),
+        (
+            ("--certify", tmp_path / "none" / "c.json"),
+            f"--certify: expected a file in a directory that exists, got {tmp_path / 'none' / 'c.json'}",
+        ),
     ):
         assert run("evaluate", DEMO, folder, "--out", tmp_path / "out", *arguments) == 2
         assert message in capsys.readouterr().err

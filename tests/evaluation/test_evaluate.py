@@ -216,13 +216,36 @@ def test_two_evaluations_are_compared_chunk_by_chunk(data: Recorded, report: Eva
             )
         apart = np.asarray(errors[0], np.float64) - np.asarray(errors[1], np.float64)
         assert (one.low, one.high) == pytest.approx((apart.min(), apart.max()), rel=1e-5)
-    for other in (
-        saccade.evaluate(demo_policy(), data, stride=4, seed=1),
-        saccade.evaluate(demo_policy(), data, stride=5),
-        saccade.evaluate(demo_policy(), data, stride=4, episodes=[0, 1]),
+
+
+def test_what_two_evaluations_do_not_share_is_named(data: Recorded, report: Evaluation) -> None:
+    assert report.noise_shape == (16, demo_policy().head.config.encoder_action_dim)
+    layout = report.layout
+    wider = dataclasses.replace(layout, keys={"hand": slice(0, 2), "gripper": slice(2, 4)})
+    one, *rest = report.predictions
+    others = dataclasses.replace(one, recorded=one.recorded + 1)
+    for name, other in (
+        ("seed of this run, 0, got 1", saccade.evaluate(demo_policy(), data, stride=4, seed=1)),
+        ("stride of this run, 4, got 5", saccade.evaluate(demo_policy(), data, stride=5)),
+        (
+            r"episodes of this run, \[0, 1, 2\], got \[0, 1\]",
+            saccade.evaluate(demo_policy(), data, stride=4, episodes=[0, 1]),
+        ),
+        ("horizon of this run, 16, got 8", dataclasses.replace(report, horizon=8)),
+        # The same seed gives a head of another width other noise.
+        (
+            r"noise_shape of this run, \(16, .*\), got \(16, 99\)",
+            dataclasses.replace(report, noise_shape=(16, 99)),
+        ),
+        (
+            r"action_keys of this run, \[\['hand', 3\], .* got \[\['hand', 2\], ",
+            dataclasses.replace(report, layout=wider),
+        ),
     ):
-        with pytest.raises(InputError, match="same episodes"):
+        with pytest.raises(InputError, match=f"^compare: expected the {name}"):
             report.compare(other)
+    with pytest.raises(InputError, match=r"^compare: episode 0: expected the recorded actions of this run"):
+        report.compare(dataclasses.replace(report, predictions=[others, *rest]))
 
 
 def test_bad_arguments_and_recordings_are_named(data: Recorded) -> None:
@@ -253,12 +276,11 @@ def test_bad_arguments_and_recordings_are_named(data: Recorded) -> None:
         saccade.evaluate(policy, blind, stride=4)
 
 
-def test_one_key_of_the_whole_width_is_the_action(data: Recorded, report: Evaluation) -> None:
+@pytest.mark.parametrize("name", ["action", "other"])
+def test_one_key_of_the_whole_width_need_not_be_the_action(name: str, data: Recorded) -> None:
     whole = [np.concatenate(parts, -1) for parts in zip(*data.done.values(), strict=True)]
-    found = saccade.evaluate(demo_policy(), Recorded(data.seen, {"action": whole}), stride=4)
-    assert found.mse == report.mse
-    with pytest.raises(InputError, match=r"expected the keys of the policy, .*, got other"):
-        saccade.evaluate(demo_policy(), Recorded(data.seen, {"other": whole}), stride=4)
+    with pytest.raises(InputError, match=rf"expected the keys of the policy, hand, gripper, got {name}"):
+        saccade.evaluate(demo_policy(), Recorded(data.seen, {name: whole}), stride=4)
 
 
 class InLerobotsForm(Recorded):
@@ -293,6 +315,8 @@ def test_policies_of_lerobot_are_asked_in_their_form(data: Recorded) -> None:
     )
     found = saccade.evaluate(policy, given, stride=4)
     expected = policy.act(given.observation(0, 4, "lerobot"), seed=(0, 0, 4))
+    # Its parts of the action have names that a data set does not know: the one key has all of them.
+    assert [group.key for group in policy.normalizer.action_groups] == ["hand", "gripper"]
     assert np.array_equal(found.predictions[0].predicted[1, 0], expected[0])
     assert np.array_equal(found.predictions[0].recorded, given.done["action"][0])
 

@@ -42,6 +42,7 @@ def run(args: argparse.Namespace) -> int:
     from saccade.diagnosis.work import MeasureEpisode
     from saccade.evaluation.episode_files import EpisodeFiles
     from saccade.evaluation.recordings import chosen_episodes
+    from saccade.evaluation.source import named
 
     source = recorded.source_of(args)
     with output.progress_bar("loading", transient=True):
@@ -54,9 +55,9 @@ def run(args: argparse.Namespace) -> int:
     files.begin(settings)
     measured = recorded.computed(MeasureEpisode(source, plan), episodes, files, args, source, "diagnose")
     report = summarised(measured, plan, list(policy.normalizer.action_slices))
-    written = {**settings, **report.to_json()}
+    written = {**named(settings, source.names()), **report.to_json()}
     write_json(args.out / "results.json", written)
-    drawn = recorded.write_page("diagnosis_page", report, written, policy, data, args.out)
+    drawn = recorded.write_page("diagnosis_page", args.out, report, written, policy, data)
     recorded.print_results(args, written, tables(report), drawn)
     return EXIT_OK
 

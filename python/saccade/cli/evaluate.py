@@ -61,8 +61,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=Path,
         metavar="CHECKPOINT|DIR",
         help="compare with another checkpoint or, if this run's precision or sampling is another, with the "
-        "same one: it is run beside this one, in float32 and as released. Or DIR: an earlier run on the same "
-        "recordings",
+        "same one: it is run too, in float32 and as released. Or DIR: an earlier run on the same recordings",
     )
     parser.add_argument(
         "--certify", type=Path, metavar="FILE", help="write what `saccade certify` checks on another machine"
@@ -72,19 +71,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Predicts, compares, writes and prints."""
     recorded.check_processes(args)
-    if args.certify is not None and args.certify.is_dir():
-        raise arguments.UsageError(
-            f"--certify: expected the name of a file, got the directory {args.certify}"
-        )
+    _check_paths(args)
     require("evaluate")
     from saccade.evaluation.certificate import SAMPLING, certify
     from saccade.evaluation.episode_files import EpisodeFiles
     from saccade.evaluation.layout import Layout
     from saccade.evaluation.open_loop import checked_stride
     from saccade.evaluation.pairing import interface_of
-    from saccade.evaluation.prediction import Predicted
+    from saccade.evaluation.prediction import Predicted, Shapes, noise_shape
     from saccade.evaluation.recordings import chosen_episodes
     from saccade.evaluation.report import summarised
+    from saccade.evaluation.source import named
     from saccade.evaluation.work import PredictEpisode
 
     source = recorded.source_of(args)
@@ -97,19 +94,21 @@ def run(args: argparse.Namespace) -> int:
             "command": "evaluate",
             **source.identity(),
             **interface_of(policy),
+            "language_key": data.language_key,
             "stride": stride,
             "seed": args.seed,
             "sampling": sampling,
         }
-    layout = Layout.of(policy.normalizer)
+    layout, shapes, noise = Layout.of(policy.normalizer), Shapes.of(policy, stride), noise_shape(policy)
     del policy  # others are loaded
     work = PredictEpisode(source, stride, args.seed, sampling)
-    other = None if args.against is None else against.chosen(args, work, settings, episodes)
-    files = EpisodeFiles(args.out, Predicted)
+    other = None if args.against is None else against.chosen(args, work, settings, episodes, shapes)
+    files = EpisodeFiles(args.out, Predicted, shapes.check)
     files.begin(settings)
+    files.write_names(source.names())
 
     def summary(predictions: Sequence[Predicted]) -> Evaluation:
-        return summarised(predictions, layout, stride, args.seed)
+        return summarised(predictions, layout, stride, args.seed, noise)
 
     before = None
     if other is not None:
@@ -117,18 +116,39 @@ def run(args: argparse.Namespace) -> int:
         before = summary(other.predictions(episodes, args))
     report = summary(recorded.computed(work, episodes, files, args, source, "evaluate"))
     shown = tables(report)
-    written = {**settings, **report.to_json(), "against": None}
+    written = {**named(settings, source.names()), **report.to_json(), "against": None}
     if other is not None and before is not None:
         comparison = report.compare(before)
-        written["against"] = against.beside(comparison, before, other.settings)
+        written["against"] = against.beside(comparison, before, named(other.settings, other.names))
         shown += against.sections(report, comparison, before, written["against"]["name"])
     write_json(args.out / "results.json", written)
     write_table(args.out / "errors.csv", report.table)
+    drawn = recorded.write_page("evaluation_page", args.out, report, written)
     if args.certify is not None:
         write_json(args.certify, certify(source, episodes, stride, args.seed, sampling).to_json())
-    drawn = recorded.write_page("evaluation_page", report, written, args.out)
     recorded.print_results(args, written, shown, drawn)
     return EXIT_OK
+
+
+def _check_paths(args: argparse.Namespace) -> None:
+    """Checks what the flags name before anything is computed.
+
+    Raises:
+        UsageError: The certificate cannot be written there, or a run is to be compared with itself.
+    """
+    if args.certify is not None:
+        folder = args.certify.parent
+        if args.certify.is_dir():
+            raise arguments.UsageError(
+                f"--certify: expected the name of a file, got the directory {args.certify}"
+            )
+        # DIR is made by this run.
+        if not folder.is_dir() and not args.out.resolve().is_relative_to(folder.resolve()):
+            raise arguments.UsageError(
+                f"--certify: expected a file in a directory that exists, got {args.certify}"
+            )
+    if args.against is not None and args.against.resolve() == args.out.resolve():
+        raise arguments.UsageError(f"--against: expected another run than that in --out, got {args.against}")
 
 
 def write_table(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:

@@ -146,15 +146,20 @@ def _each(
     return found
 
 
-def write_page(name: str, *given: Any) -> bool:
-    """Lets the lab draw; without it, says on standard error what to install."""
+def write_page(name: str, folder: Path, *given: Any) -> bool:
+    """Lets the lab draw the page in DIR; without it, says on standard error what to install.
+
+    An earlier run's page is removed first: it may have other episodes, and shows older results.
+    """
+    for stale in (folder / "index.html", *(folder / "curves").glob("[0-9]*.png")):
+        stale.unlink(missing_ok=True)
     draw = extension(name)
     if draw is None:
         output.note(
             "saccade", f"pictures and the page need {LAB}; install it with: {extras.install_lab('sim')}"
         )
         return False
-    draw(*given)
+    draw(*given, folder)
     return True
 
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from saccade._internal.arrays import integer
 from saccade.errors import InputError
 from saccade.evaluation.layout import Layout
-from saccade.evaluation.prediction import horizon_of, predict_episode
+from saccade.evaluation.prediction import horizon_of, noise_shape, predict_episode
 from saccade.evaluation.recordings import Recordings, chosen_episodes, fitted
 from saccade.evaluation.report import Evaluation, summarised
 
@@ -66,7 +66,7 @@ def evaluate(
         )
         if on_episode is not None:
             on_episode(len(predictions))
-    return summarised(predictions, Layout.of(policy.normalizer), step, seed)
+    return summarised(predictions, Layout.of(policy.normalizer), step, seed, noise_shape(policy))
 
 
 def checked_stride(policy: Policy, stride: int | None) -> int:

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from saccade._internal.arrays import Float32Array
-from saccade.errors import InputError
+from saccade.errors import InputError, ShapeError
 from saccade.evaluation.recordings import Recordings, actions_of, length_of, observation_at
 
 if TYPE_CHECKING:
@@ -50,11 +50,64 @@ class Predicted:
         return int(self.predicted.shape[2])
 
 
+@dataclass(frozen=True)
+class Shapes:
+    """What the arrays of :class:`Predicted` have in common in a run.
+
+    Attributes:
+        stride, horizon: Steps between two chunks, and actions in one.
+        action, head_action, state: Widths of an action, of a normalised one, and of a state.
+    """
+
+    stride: int
+    horizon: int
+    action: int
+    head_action: int
+    state: int
+
+    @classmethod
+    def of(cls, policy: Policy, stride: int) -> Shapes:
+        """Those of a policy; raises as :func:`horizon_of`."""
+        robot = policy.normalizer
+        return cls(stride, horizon_of(policy), robot.action_width, robot.head_action_width, robot.state_width)
+
+    def check(self, one: Predicted) -> None:
+        """Checks an episode that was read from a file.
+
+        Raises:
+            ShapeError: An array has another shape or type, or the steps are others; the message names it.
+        """
+        length = len(one.recorded) if np.ndim(one.recorded) else 0
+        steps = np.arange(0, length, self.stride)
+        chunks = len(steps)
+        expected = {
+            "recorded": (max(length, 1), self.action),  # an episode has a step
+            "predicted": (chunks, SAMPLES, self.horizon, self.action),
+            "normalized_recorded": (chunks, self.horizon, self.head_action),
+            "normalized": (chunks, SAMPLES, self.horizon, self.head_action),
+            "state": (chunks, self.state),
+            "seconds": (),
+        }
+        for name, shape in expected.items():
+            given = np.asarray(getattr(one, name))
+            if given.shape != shape or given.dtype.kind != "f":
+                raise ShapeError(
+                    f"{name}: expected floating numbers of shape {shape}, got {given.dtype} of {given.shape}"
+                )
+        if not np.array_equal(one.steps, steps):
+            raise ShapeError(f"steps: expected every {self.stride}th of {length} steps, got others")
+
+
 def noise_of(policy: Policy, seed: int, episode: int, step: int, samples: int = SAMPLES) -> Float32Array:
     """The noise of the samples of one observation, ``(samples, horizon, width)`` of the head."""
+    rng = np.random.default_rng((seed, episode, step))
+    return rng.standard_normal((samples, *noise_shape(policy)), dtype=np.float32)
+
+
+def noise_shape(policy: Policy) -> tuple[int, int]:
+    """The shape of the head's noise for a chunk, ``(horizon, width)``."""
     config = policy.head.config
-    shape = (samples, config.action_horizon, config.encoder_action_dim)
-    return np.random.default_rng((seed, episode, step)).standard_normal(shape, dtype=np.float32)
+    return config.action_horizon, config.encoder_action_dim
 
 
 def horizon_of(policy: Policy) -> int:

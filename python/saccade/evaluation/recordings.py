@@ -143,7 +143,8 @@ def actions_of(policy: Policy, data: Recordings, episode: int, horizon: int) -> 
     """All recorded actions of an episode, ``(steps, action_width)`` in the policy's order of keys.
 
     They are read in pieces of ``horizon``, since a data set may have no more at once. float64 if they were
-    recorded so, else float32. A recording with the one key ``action`` fits any policy of its width.
+    recorded so, else float32. For a policy of lerobot, whose parts of the action a data set does not name,
+    the one key ``action`` has all of them.
 
     Raises:
         InputError, ShapeError: A key is missing, has another width, or is not finite.
@@ -166,10 +167,10 @@ def _joined(
     policy: Policy, given: Mapping[str, npt.NDArray[Any]], where: str, length: int
 ) -> npt.NDArray[np.floating[Any]]:
     groups = policy.normalizer.action_groups
-    names, width = [group.key for group in groups], policy.normalizer.action_width
+    names = [group.key for group in groups]
     where = f"{where}: actions"
-    if list(given) == [ACTION] and names != [ACTION] and np.shape(given[ACTION])[-1:] == (width,):
-        return _checked(where, given[ACTION], length, width)
+    if policy.normalizer.pipeline is not None and list(given) == [ACTION]:
+        return _checked(where, given[ACTION], length, policy.normalizer.action_width)
     missing = [name for name in names if name not in given]
     if missing:
         raise InputError(

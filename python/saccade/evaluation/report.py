@@ -19,6 +19,7 @@ from saccade.evaluation.measures import (
     executed,
     table,
 )
+from saccade.evaluation.pairing import check_shared
 from saccade.evaluation.prediction import Predicted
 
 
@@ -58,6 +59,8 @@ class Evaluation:
         hold: What ``"hold"`` repeats: ``"state"`` or ``"zero"``, by key.
         table: A row for each episode, step of an observation and key, with the errors of ``actions`` actions.
         stride, horizon, seed: Steps between two observations, actions in a chunk, and the seed.
+        noise_shape: That of the head's noise for a chunk, ``(horizon, width)``. With the seed it decides the
+            noise.
         predictions: The recorded and predicted actions of each episode.
         layout: Where the keys are in them.
     """
@@ -71,6 +74,7 @@ class Evaluation:
     stride: int
     horizon: int
     seed: int
+    noise_shape: tuple[int, int]
     predictions: Sequence[Predicted]
     layout: Layout
 
@@ -91,7 +95,7 @@ class Evaluation:
 
     @property
     def seconds(self) -> float:
-        """How long the predictions took."""
+        """How long the predictions took: the sum over episodes, also of those computed at the same time."""
         return sum(one.seconds for one in self.predictions)
 
     @property
@@ -100,24 +104,22 @@ class Evaluation:
         return sum(len(one.steps) for one in self.predictions)
 
     def compare(self, other: Evaluation) -> Comparison:
-        """This evaluation against another one of the same recordings, with the same stride and seed.
+        """This evaluation against another one of the same recordings, with the same noise.
+
+        An evaluation does not hold what the policies saw: that two are of the same observations is only known
+        from the recorded actions.
 
         Raises:
-            InputError: They are not of the same observations and noise.
+            InputError: They have other episodes or recorded actions, or another stride, horizon, seed, shape
+                of the noise or keys of the action; the message names the first difference.
         """
-        pairs = list(zip(self.predictions, other.predictions, strict=False))
-        same = len(self.predictions) == len(other.predictions) and all(
-            one.episode == two.episode
-            and np.array_equal(one.steps, two.steps)
-            and np.array_equal(one.recorded, two.recorded)
-            for one, two in pairs
-        )
-        settings = [(one.stride, one.horizon, one.seed, tuple(one.layout.keys)) for one in (self, other)]
-        if not same or settings[0] != settings[1]:
-            raise InputError(
-                "compare: expected evaluations of the same episodes, with the same stride, horizon, seed and "
-                f"keys, got {self} and {other}"
-            )
+        check_shared(other._shared(), self._shared(), "compare", self._shared())
+        pairs = list(zip(self.predictions, other.predictions, strict=True))
+        for one, two in pairs:
+            if not np.array_equal(one.recorded, two.recorded):
+                raise InputError(
+                    f"compare: episode {one.episode}: expected the recorded actions of this run, got others"
+                )
         errors = [[episode_errors(one, self.stride, self.layout) for one in pair] for pair in pairs]
         apart = np.concatenate(
             [
@@ -136,6 +138,17 @@ class Evaluation:
             mean={key: float(apart[:, where].mean()) for key, where in self.layout.keys.items()},
             equal=all(np.array_equal(one.predicted[:, 0], two.predicted[:, 0]) for one, two in pairs),
         )
+
+    def _shared(self) -> dict[str, Any]:
+        """What an evaluation must have in common with another one, in the order in which it is compared."""
+        return {
+            "stride": self.stride,
+            "horizon": self.horizon,
+            "seed": self.seed,
+            "noise_shape": self.noise_shape,
+            "action_keys": [[key, where.stop - where.start] for key, where in self.layout.keys.items()],
+            "episodes": [one.episode for one in self.predictions],
+        }
 
     def to_json(self) -> dict[str, Any]:
         """Everything but the actions, as JSON values."""
@@ -170,7 +183,9 @@ def _difference(pairs: Sequence[tuple[Any, Any]]) -> Estimate:
     return bootstrap_ratio(found, np.ones(len(found)), range(len(found)))
 
 
-def summarised(predictions: Sequence[Predicted], layout: Layout, stride: int, seed: int) -> Evaluation:
+def summarised(
+    predictions: Sequence[Predicted], layout: Layout, stride: int, seed: int, noise_shape: tuple[int, int]
+) -> Evaluation:
     """The evaluation of predicted episodes."""
     found = [episode_errors(one, stride, layout) for one in predictions]
     horizon = predictions[0].horizon
@@ -185,6 +200,7 @@ def summarised(predictions: Sequence[Predicted], layout: Layout, stride: int, se
         stride=stride,
         horizon=horizon,
         seed=seed,
+        noise_shape=noise_shape,
         predictions=predictions,
         layout=layout,
     )

@@ -21,6 +21,7 @@ import pandas as pd
 import pytest
 
 import saccade
+from saccade._internal.environment import arithmetic
 from saccade.cli import main, recorded
 from saccade.errors import InputError
 from saccade.evaluation.source import weights_hash
@@ -274,7 +275,7 @@ def test_a_machine_that_computes_other_bits_is_named(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    expected = {**cluster_module.arithmetic(), name: value}
+    expected = {**arithmetic(), name: value}
     monkeypatch.setattr(cluster_module, "arithmetic", lambda: expected)
     with pytest.raises(InputError, match=message):
         list(each(Square(tmp_path / "log"), [1], nodes.workers))

@@ -6,6 +6,7 @@ import re
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -23,11 +24,13 @@ BROWSER, DRIVER = shutil.which("chromium"), shutil.which("chromedriver")
 needs_browser = pytest.mark.skipif(
     BROWSER is None or DRIVER is None, reason="needs Debian's chromium and chromium-driver"
 )
-ABOUT = {
+ABOUT: dict[str, Any] = {
     "checkpoint": {"name": "<policy>", "sha256": "0" * 64},
     "recordings": {"name": "tiny & small", "sha256": "1" * 64},
     "saccade": "0",
+    "library": "0" * 12,
     "instruction_set": "portable",
+    "dot_products": [],
     "against": None,
 }
 LENGTHS = (9, 5, 8, 3, 12)
