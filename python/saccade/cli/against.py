@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any
 
+from saccade._internal.estimate_text import interval
 from saccade.cli import describe, output, recorded
 from saccade.cli.output import Section
 from saccade.errors import InputError, SaccadeError
@@ -174,5 +175,5 @@ def sections(report: Evaluation, comparison: Comparison, other: Evaluation, name
 
 
 def _row(name: str, own: float, other: float, difference: Estimate) -> list[str]:
-    low, high = f"{difference.low:.4g}", f"{difference.high:.4g}"
-    return [name, f"{own:.6g}", f"{other:.6g}", f"{difference.value:.6g}", f"{low} to {high}"]
+    bounds = interval(difference.low, difference.high, ".4g")
+    return [name, f"{own:.6g}", f"{other:.6g}", f"{difference.value:.6g}", bounds]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING
 
+from saccade._internal.estimate_text import caution, interval, number
 from saccade._internal.files import write_json
 from saccade.cli import EXIT_OK, output, recorded, require
 from saccade.cli.output import Section
@@ -64,24 +65,28 @@ def run(args: argparse.Namespace) -> int:
 
 def tables(report: Diagnosis) -> list[Section]:
     """The verdicts, and the effect of every change."""
+    from saccade.diagnosis.report import episode_counts
+
     verdicts = [
-        [name, one.name, f"{one.effect:.2f}", f"{one.low:.2f} to {one.high:.2f}"]
+        [name, one.name, number(one.effect, ".2f"), interval(one.low, one.high, ".2f")]
         for name, one in report.inputs.items()
     ]
     effects = [
         [
             name,
             change,
-            f"{one.share.value:.3f}",
-            f"{one.share.low:.3f} to {one.share.high:.3f}",
-            f"{one.of_noise.value:.2f}",
+            number(one.share.value, ".3f"),
+            interval(one.share.low, one.share.high, ".3f"),
+            number(one.of_noise.value, ".2f"),
+            str(one.episodes),
             ", ".join(f"{key} {value:.4g}" for key, value in one.units.items()),
         ]
         for name, verdict in report.inputs.items()
         for change, one in verdict.changes.items()
     ]
     title = "Effects, as shares of what another observation and what another noise changes"
+    head = ["input", "change", ">effect", ">95 %", ">of noise", ">episodes", "in the robot's units"]
     return [
         Section("What the policy listens to", ["input", "verdict", ">effect", ">95 %"], verdicts),
-        Section(title, ["input", "change", ">effect", ">95 %", ">of noise", "in the robot's units"], effects),
+        Section(title, head, effects, note=caution(episode_counts(report))),
     ]

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from saccade._internal import flags as arguments
+from saccade._internal.estimate_text import caution, interval, number
 from saccade._internal.files import write_atomically, write_json
 from saccade.cli import EXIT_OK, against, output, recorded, require
 from saccade.cli.output import Section
@@ -168,10 +169,11 @@ def tables(report: Evaluation) -> list[Section]:
     }
     rows = []
     for name, one in named.items():
-        low, high = one.intervals["mse"]
-        normalized = "" if one.normalized_mse != one.normalized_mse else f"{one.normalized_mse:.6f}"
-        rows.append([name, f"{one.mse:.6g}", f"{low:.4g} to {high:.4g}", f"{one.mae:.6g}", normalized])
+        normalized = number(one.normalized_mse, ".6f")
+        bounds = interval(*one.intervals["mse"], ".4g")
+        rows.append([name, f"{one.mse:.6g}", bounds, f"{one.mae:.6g}", normalized])
     title = (
         f"Errors of {report.num_chunks} chunks in {len(report.predictions)} episodes, in the robot's units"
     )
-    return [Section(title, ["", ">MSE", ">95 %", ">MAE", ">normalised MSE"], rows)]
+    head = ["", ">MSE", ">95 %", ">MAE", ">normalised MSE"]
+    return [Section(title, head, rows, note=caution([len(report.predictions)]))]

@@ -110,11 +110,12 @@ def console(*, stderr: bool = False, width: int | None = None) -> Console:
 
 @dataclass(frozen=True)
 class Section:
-    """A table; columns whose names begin with ">" are numbers, aligned right."""
+    """A table; columns whose names begin with ">" are numbers, aligned right. A note is printed below."""
 
     title: str
     columns: Sequence[str]
     rows: Sequence[Sequence[str]]
+    note: str = ""
 
 
 def show(tables: Sequence[Section]) -> None:
@@ -134,11 +135,21 @@ def show(tables: Sequence[Section]) -> None:
         for row in section.rows:
             table.add_row(*map(Text, row))
         shown.print(table)
+        if section.note:
+            shown.print(Text(section.note))
         shown.print()
 
 
 def plain(section: Section) -> str:
-    """A table as text in plain columns."""
+    """A table as text in plain columns.
+
+    Example:
+        >>> print(plain(Section("Errors", ["key", ">MSE"], [["hand", "0.5"]], note="One episode.")))
+        Errors
+        key   MSE
+        hand  0.5
+        One episode.
+    """
     rows = [[column.lstrip(">") for column in section.columns], *section.rows]
     widths = [max(len(row[index]) for row in rows) for index in range(len(section.columns))]
     lines = [
@@ -148,7 +159,7 @@ def plain(section: Section) -> str:
         ).rstrip()
         for row in rows
     ]
-    return "\n".join([section.title, *lines])
+    return "\n".join([section.title, *lines, *filter(None, [section.note])])
 
 
 class Update(Protocol):

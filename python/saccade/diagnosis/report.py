@@ -22,7 +22,7 @@ class Diagnosis:
         noise: The effect of another noise.
         edges: The effects of cutting ``"text"`` and ``"images"`` off inside the head.
         plan: Episodes, partners and instructions.
-        seconds: How long it took.
+        seconds: How long the episodes took, summed, also of those computed at the same time.
     """
 
     inputs: Mapping[str, Verdict]
@@ -50,6 +50,12 @@ class Diagnosis:
     def __repr__(self) -> str:
         found = ", ".join(f"{name}: {one.name} ({one.effect:.2f})" for name, one in self.inputs.items())
         return f"<saccade.Diagnosis {found}>"
+
+
+def episode_counts(report: Diagnosis) -> set[int]:
+    """The numbers of episodes that the intervals of a diagnosis are over."""
+    effects = [one for verdict in report.inputs.values() for one in verdict.changes.values()]
+    return {len(report.plan.episodes), *(one.episodes for one in effects)}
 
 
 def summarised(measured: Sequence[Measured], plan: Plan, keys: Sequence[str]) -> Diagnosis:
