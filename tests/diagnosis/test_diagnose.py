@@ -228,6 +228,7 @@ def test_the_report_is_json_and_names_what_was_done() -> None:
     values = found.to_json()
     assert values["episodes"] == [0, 2, 4]
     assert {one["name"] for one in values["inputs"].values()} == {"undecided"}  # of three episodes
+    assert {one["rule"] for one in values["inputs"].values()} == {1}
     assert values["inputs"]["instruction"]["changes"]["replaced"]["kind"] == "main"
     assert set(found.edges) == {"text", "images"}
     assert all(one.share.value > 0 for one in found.edges.values())

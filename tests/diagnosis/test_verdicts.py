@@ -3,70 +3,74 @@
 from __future__ import annotations
 
 import math
+import re
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from saccade._internal.bootstrap import Estimate
-from saccade.diagnosis import verdicts
-from saccade.diagnosis.changes import Kind
+from saccade.diagnosis import Effect, verdicts
 from saccade.diagnosis.effects import Measured
-from saccade.diagnosis.verdicts import Effect, decided, effect_of, verdict_of
+from saccade.diagnosis.verdicts import decided, effect_of, verdict_of
+from tests.helpers.effect_cases import SEEN, effect
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "diagnose.md"
 
 
-def effect(kind: Kind | None, low: float, high: float, episodes: int = 20, of_noise: float = 5.0) -> Effect:
-    return Effect(
-        kind=kind,
-        share=Estimate((low + high) / 2, low, high),
-        of_noise=Estimate(of_noise, of_noise, of_noise),
-        units={},
-        episodes=episodes,
-        largest=(0, 0),
-    )
-
-
-SEEN = effect(None, 1, 1)
-
-
 @pytest.mark.parametrize(
-    ("changes", "expected"),
+    ("changes", "expected", "rule"),
     [
-        ({"a": effect("main", 0.21, 0.4)}, "used"),
-        ({"a": effect("main", 0.20, 0.4)}, "undecided"),
-        ({"a": effect("main", 0.0, 0.049)}, "ignored"),
-        ({"a": effect("main", 0.0, 0.0)}, "ignored"),
-        ({"a": effect("main", 0.0, 0.05)}, "undecided"),
-        ({"a": effect("main", 0.06, 0.19)}, "barely used"),
-        ({"a": effect("main", 0.06, 0.20)}, "undecided"),
-        ({"a": effect("main", 0.0, 0.01), "b": effect("natural", 0.06, 0.9)}, "barely used"),
-        ({"a": effect("main", 0.0, 0.01), "b": effect("natural", 0.04, 0.06)}, "undecided"),
-        ({"a": effect("main", 0.0, 0.01), "b": effect("removal", 0.1, 0.19)}, "ignored"),
-        ({"a": effect("main", 0.0, 0.01), "b": effect("removal", 0.1, 0.21)}, "barely used"),
-        ({"a": effect("main", 0.3, 0.5), "b": effect("natural", 0.0, 0.01)}, "used"),
+        ({"a": effect("main", 0.21, 0.4)}, "used", 5),
+        ({"a": effect("main", 0.20, 0.4)}, "undecided", 8),
+        ({"a": effect("main", 0.0, 0.049)}, "ignored", 6),
+        ({"a": effect("main", 0.0, 0.0)}, "ignored", 6),
+        ({"a": effect("main", 0.0, 0.05)}, "undecided", 8),
+        ({"a": effect("main", 0.06, 0.19)}, "barely used", 7),
+        ({"a": effect("main", 0.06, 0.20)}, "undecided", 8),
+        ({"a": effect("main", 0.0, 0.01), "b": effect("natural", 0.06, 0.9)}, "barely used", 7),
+        ({"a": effect("main", 0.0, 0.01), "b": effect("natural", 0.04, 0.06)}, "undecided", 8),
+        ({"a": effect("main", 0.0, 0.01), "b": effect("removal", 0.1, 0.19)}, "ignored", 6),
+        ({"a": effect("main", 0.0, 0.01), "b": effect("removal", 0.1, 0.21)}, "barely used", 7),
+        ({"a": effect("main", 0.3, 0.5), "b": effect("natural", 0.0, 0.01)}, "used", 5),
+        # No change, or those of too few episodes.
+        ({}, "undecided", 3),
+        ({"a": effect("main", 0.8, 0.9, episodes=4)}, "undecided", 3),
         # No main change, or one in too few episodes.
-        ({"b": effect("removal", 0.0, 0.04)}, "ignored"),
-        ({"b": effect("removal", 0.0, 0.06)}, "undecided"),
-        ({"b": effect("natural", 0.8, 0.9)}, "undecided"),
-        ({"a": effect("main", 0.8, 0.9, episodes=4)}, "undecided"),
-        ({"a": effect("main", 0.8, 0.9, episodes=4), "b": effect("natural", 0.0, 0.01)}, "ignored"),
-        ({"a": effect("main", math.nan, math.nan)}, "undecided"),
+        ({"b": effect("removal", 0.0, 0.04)}, "ignored", 4),
+        ({"b": effect("removal", 0.0, 0.06)}, "undecided", 4),
+        ({"b": effect("natural", 0.8, 0.9)}, "undecided", 4),
+        ({"a": effect("main", 0.8, 0.9, episodes=4), "b": effect("natural", 0.0, 0.01)}, "ignored", 4),
+        ({"a": effect("main", math.nan, math.nan)}, "undecided", 8),
     ],
 )
-def test_the_first_rule_that_holds_decides(changes: dict[str, Effect], expected: str) -> None:
-    assert decided(changes, SEEN) == expected
+def test_the_first_rule_that_holds_decides(changes: dict[str, Effect], expected: str, rule: int) -> None:
+    assert decided(changes, SEEN) == (expected, rule)
+    assert verdict_of(changes, SEEN).rule == rule
 
 
 def test_few_episodes_and_a_deaf_policy_come_first() -> None:
     used = {"a": effect("main", 0.5, 0.9)}
-    assert decided(used, effect(None, 1, 1, episodes=4)) == "undecided"
-    assert decided(used, None) == "undecided"
-    assert decided(used, effect(None, 1, 1, of_noise=0.009)) == "ignored"
-    assert decided({}, effect(None, 1, 1, of_noise=0.009)) == "ignored"
-    assert decided({}, SEEN) == "undecided"
-    assert decided(used, effect(None, 1, 1, of_noise=0.011)) == "used"
+    assert decided(used, effect(None, 1, 1, episodes=4)) == ("undecided", 1)
+    assert decided(used, None) == ("undecided", 1)
+    assert decided(used, effect(None, 1, 1, of_noise=0.009)) == ("ignored", 2)
+    assert decided({}, effect(None, 1, 1, of_noise=0.009)) == ("ignored", 2)
+    assert decided(used, effect(None, 1, 1, of_noise=0.011)) == ("used", 5)
+
+
+def test_the_page_has_the_rules_with_their_numbers_and_names() -> None:
+    text = PAGE.read_text(encoding="utf-8")
+    listed = re.findall(r"^(\d)\. \*\*(used|barely used|ignored|undecided)\*\*", text, re.MULTILINE)
+    assert [int(number) for number, _ in listed] == [rule.value for rule in verdicts.Rule]
+    assert [name for _, name in listed] == [
+        "undecided",
+        "ignored",
+        "undecided",
+        "ignored",  # or undecided
+        "used",
+        "ignored",
+        "barely used",
+        "undecided",
+    ]
 
 
 def test_the_page_states_the_numbers() -> None:

@@ -10,34 +10,18 @@ from typing import Any
 import jinja2
 
 from saccade import Policy
+from saccade._internal import estimate_text
 from saccade._internal.files import write_atomically
 from saccade.diagnosis import Diagnosis, Verdict
 from saccade.diagnosis.changes import camera_of, replacement
+from saccade.diagnosis.report import episode_counts
 from saccade.evaluation import Evaluation, Recordings
 from saccade.evaluation.recordings import observation_at
 from saccade_lab.extras import LAB
 from saccade_lab.recordings import pictures
+from saccade_lab.recordings.advice import advice
 
 SHOWN = 12  # episodes whose curves are on the page; all are in curves/
-
-#: What to do about a verdict, by the beginning of the input's name.
-ADVICE = {
-    "instruction": "Record every task in every scene, so that the scene does not tell the task; have several "
-    "tasks, and several wordings of each. If the episodes have one instruction only, nothing teaches the "
-    "policy to listen. A shared scene with two instructions is the test. Guidance may help meanwhile.",
-    "camera": "Look at its frames: is it black, frozen, or does it see nothing that another camera does not? "
-    "Compare the order and names of the cameras with those of the training. If it is not needed, a policy "
-    "trained without it is faster.",
-    "state": "Check the statistics and the order of the state's keys. If the frames tell the state, ignoring "
-    "it does no harm and helps on a robot with other sensors.",
-    "history": "The newest frame and state tell what the policy needs; one step is faster.",
-}
-SAME = "It is the same in all of these recordings, so they cannot show whether the policy uses it."
-UNDECIDED = "Record more episodes, or pass more with --episodes: the interval contains a limit."
-STATE = (
-    "The state may leak the action: a policy that repeats what the arm does anyway looks good in open loop "
-    "and drifts on the robot. If frozen states change the actions most, try dropping the state in training."
-)
 
 
 def evaluation_page(report: Evaluation, about: Mapping[str, Any], folder: Path) -> None:
@@ -64,6 +48,7 @@ def evaluation_page(report: Evaluation, about: Mapping[str, Any], folder: Path) 
         about=about,
         curves=shown,
         hidden=len(report.predictions) - len(shown),
+        caution=estimate_text.caution([len(report.predictions)]),
         by_step=pictures.data_url(pictures.png(pictures.by_step(report))),
     )
 
@@ -81,7 +66,7 @@ def diagnosis_page(
         {
             "name": name,
             "verdict": verdict,
-            "advice": _advice(name, verdict),
+            "advice": advice(name, verdict),
             "most": _most(verdict),
             "frames": _frames(name, verdict, policy, data, report),
             "texts": _texts(name, verdict, policy, data, report),
@@ -96,19 +81,8 @@ def diagnosis_page(
         about=about,
         inputs=inputs,
         effects=effects,
+        caution=estimate_text.caution(episode_counts(report)),
     )
-
-
-def _advice(name: str, verdict: Verdict) -> str:
-    if not verdict.changes:
-        return SAME
-    if verdict.name == "undecided":
-        return UNDECIDED
-    kind = name.partition(".")[0]
-    frozen = verdict.changes.get("frozen")
-    if kind == "state" and verdict.name == "used" and frozen is not None and frozen.share.low > 1:
-        return STATE
-    return "" if verdict.name == "used" else ADVICE[kind]
 
 
 def _most(verdict: Verdict) -> tuple[str, int, int] | None:
@@ -165,5 +139,6 @@ def _frames(
 def _write(path: Path, template: str, **values: Any) -> None:
     source = (resources.files("saccade_lab.recordings") / template).read_text(encoding="utf-8")
     environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined)
+    environment.globals.update(number=estimate_text.number, interval=estimate_text.interval)
     with write_atomically(path) as temporary:
         temporary.write_text(environment.from_string(source).render(**values), encoding="utf-8")

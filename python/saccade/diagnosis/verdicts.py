@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from enum import IntEnum
 from typing import Literal, TypeAlias
 
 import numpy as np
@@ -19,6 +20,19 @@ FEWEST_EPISODES = 5
 USED, IGNORED = 0.20, 0.05  # of what another observation changes
 REMOVED = 0.20  # that a removal may change of an ignored input
 DEAF = 0.01  # of what another noise changes, by another observation
+
+
+class Rule(IntEnum):
+    """The rules of ``docs/diagnose.md`` by their numbers; the first that holds decides."""
+
+    FEW_EPISODES = 1
+    DEAF = 2
+    NO_CHANGE = 3
+    NO_MAIN_CHANGE = 4
+    USED = 5
+    IGNORED = 6
+    BARELY_USED = 7
+    UNDECIDED = 8
 
 
 @dataclass(frozen=True)
@@ -52,6 +66,7 @@ class Verdict:
             change, the largest of the others; NaN if no change is possible.
         low, high: Its 95 % interval.
         changes: All changes of the input, by name.
+        rule: Number of the rule of ``docs/diagnose.md`` that decided.
     """
 
     name: VerdictName
@@ -59,6 +74,7 @@ class Verdict:
     low: float
     high: float
     changes: Mapping[str, Effect]
+    rule: int
 
 
 def effect_of(
@@ -101,8 +117,8 @@ def _share(parts: Sequence[float], wholes: Sequence[float], episodes: Sequence[i
     return Estimate(*(math.sqrt(value) for value in (found.value, found.low, found.high)))
 
 
-def decided(changes: Mapping[str, Effect], observation: Effect | None) -> VerdictName:
-    """The verdict on an input.
+def decided(changes: Mapping[str, Effect], observation: Effect | None) -> tuple[VerdictName, Rule]:
+    """The verdict on an input, and the rule that decided.
 
     Args:
         changes: Its changes by name.
@@ -110,22 +126,23 @@ def decided(changes: Mapping[str, Effect], observation: Effect | None) -> Verdic
     """
     possible = possible_of(changes)
     if observation is None or observation.episodes < FEWEST_EPISODES:
-        return "undecided"
+        return "undecided", Rule.FEW_EPISODES
     if observation.of_noise.high < DEAF:
-        return "ignored"
+        return "ignored", Rule.DEAF
     if not possible:
-        return "undecided"
+        return "undecided", Rule.NO_CHANGE
     main = [one.share for one in possible.values() if one.kind == "main"]
     if not main:
-        return "ignored" if all(one.share.high < IGNORED for one in possible.values()) else "undecided"
+        has_none = all(one.share.high < IGNORED for one in possible.values())
+        return ("ignored" if has_none else "undecided"), Rule.NO_MAIN_CHANGE
     if main[0].low > USED:
-        return "used"
+        return "used", Rule.USED
     limits = {"main": IGNORED, "natural": IGNORED, "removal": REMOVED}
     if all(one.share.high < limits[str(one.kind)] for one in possible.values()):
-        return "ignored"
+        return "ignored", Rule.IGNORED
     if main[0].high < USED and any(one.share.low > IGNORED for one in possible.values()):
-        return "barely used"
-    return "undecided"
+        return "barely used", Rule.BARELY_USED
+    return "undecided", Rule.UNDECIDED
 
 
 def possible_of(changes: Mapping[str, Effect]) -> dict[str, Effect]:
@@ -140,4 +157,5 @@ def verdict_of(changes: Mapping[str, Effect], observation: Effect | None) -> Ver
     others = sorted(shown, key=lambda one: one.share.value, reverse=True)
     nothing = Estimate(math.nan, math.nan, math.nan)
     effect = next((one.share for one in (*main, *others)), nothing)
-    return Verdict(decided(changes, observation), effect.value, effect.low, effect.high, dict(changes))
+    name, rule = decided(changes, observation)
+    return Verdict(name, effect.value, effect.low, effect.high, dict(changes), int(rule))

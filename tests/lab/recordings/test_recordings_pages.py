@@ -18,6 +18,7 @@ import saccade
 from saccade.cli.against import beside
 from saccade.evaluation import Evaluation
 from saccade_lab.recordings import pages
+from saccade_lab.recordings.advice import SAME
 from tests.helpers.recorded_cases import Recorded, demo_policy, made_up, still
 
 BROWSER, DRIVER = shutil.which("chromium"), shutil.which("chromedriver")
@@ -65,11 +66,16 @@ def written(data: Recorded, report: Evaluation, tmp_path_factory: pytest.TempPat
     return found
 
 
+def plain(folder: Path) -> str:
+    """The words of a page."""
+    return re.sub(r"<[^>]*>", " ", (folder / "index.html").read_text(encoding="utf-8"))
+
+
 def test_an_input_without_a_change_is_on_the_page(tmp_path: Path) -> None:
     data = still((1, 1, 1, 1, 1))
     pages.diagnosis_page(saccade.diagnose(demo_policy(), data), ABOUT, demo_policy(), data, tmp_path)
     text = (tmp_path / "index.html").read_text(encoding="utf-8")
-    assert text.count(pages.SAME) == 2  # the state, and the camera that is black
+    assert text.count(SAME) == 2  # the state, and the camera that is black
     assert "nan" not in re.sub(r"<[^>]*>", "", text).lower()
 
 
@@ -106,6 +112,29 @@ def test_the_evaluations_page_has_its_numbers(
         pixels = np.asarray(picture.convert("RGB"))
     for colour in ((0xD5, 0x5E, 0x00), (0, 0, 0)):  # predicted over recorded
         assert (pixels == colour).all(axis=-1).sum() > 50
+
+
+def test_one_episode_has_no_interval(data: Recorded, tmp_path: Path) -> None:
+    report = saccade.evaluate(demo_policy(), data, episodes=[2], stride=4)
+    other = saccade.evaluate(demo_policy(), data, episodes=[2], stride=4, num_steps=1)
+    settings = {**ABOUT, "options": {"precision": "float32"}, "sampling": {"num_steps": 1}}
+    against = beside(report.compare(other), other, settings)
+    pages.evaluation_page(report, {**ABOUT, "against": against}, tmp_path)
+    text = plain(tmp_path)
+    assert "nan" not in text.lower()
+    assert "One episode has no interval." in text
+    rows = re.findall(r'<td class="n">–</td>', (tmp_path / "index.html").read_text(encoding="utf-8"))
+    # Of each error the interval, and for the baselines the normalised error; then of each difference.
+    assert len(rows) == (3 + 2 * 3) + 4
+    assert [path.name for path in (tmp_path / "curves").iterdir()] == ["000002.png"]
+
+
+@pytest.mark.parametrize("name", ["evaluation", "diagnosis"])
+def test_a_page_of_few_episodes_says_that_its_intervals_are_too_narrow(
+    name: str, written: dict[str, Path]
+) -> None:
+    text = plain(written[name])
+    assert re.search(r"intervals are over (\d to )?5 episodes: with fewer than 10 they are too narrow", text)
 
 
 def test_the_diagnosis_page_has_every_input_with_its_frames(written: dict[str, Path]) -> None:
