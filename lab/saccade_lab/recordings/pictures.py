@@ -13,6 +13,7 @@ from PIL import Image
 from saccade.diagnosis import Diagnosis, Effect
 from saccade.evaluation import Evaluation, Predicted
 from saccade.evaluation.measures import executed
+from saccade_lab.recordings.baselines import baselines_by_step
 
 RECORDED, PREDICTED, SOFT = "#000000", "#d55e00", "#0072b2"
 COLUMNS = 4  # joints side by side
@@ -44,7 +45,7 @@ def curves(report: Evaluation, one: Predicted) -> Figure:
 
 
 def by_step(report: Evaluation) -> Figure:
-    """The mean squared error of each step of the horizon, with its interval."""
+    """The mean squared error of each step of the horizon with its interval, and that of the baselines."""
     figure = Figure(figsize=(6.4, 2.6), layout="constrained")
     axes = figure.add_subplot()
     known = [(step, one) for step, one in enumerate(report.by_step) if one.intervals]
@@ -57,10 +58,11 @@ def by_step(report: Evaluation) -> Figure:
         alpha=0.2,
         linewidth=0,
     )
-    axes.plot(steps, [one.mse for _, one in known], color=SOFT)
-    for name, one in report.baselines.items():
-        axes.axhline(one.mse, color="0.5", linewidth=0.8, linestyle=":")
-        axes.annotate(name, (steps[-1], one.mse), fontsize=7, color="0.35", va="bottom", ha="right")
+    axes.plot(steps, [one.mse for _, one in known], color=SOFT, label="policy")
+    for name, errors in baselines_by_step(report).items():
+        baseline = [errors[step] for step in steps]
+        axes.plot(steps, baseline, color="0.5", linewidth=0.8, linestyle=":", label=name)
+        axes.annotate(name, (steps[-1], baseline[-1]), fontsize=7, color="0.35", va="bottom", ha="right")
     axes.set_xlabel("step of the horizon")
     axes.set_ylabel("MSE")
     axes.set_ylim(bottom=0)
