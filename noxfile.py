@@ -223,7 +223,7 @@ def test_compat(session: nox.Session) -> None:
 
 @nox.session(name="test-clients")
 def test_clients(session: nox.Session) -> None:
-    """Test `saccade serve` with Isaac-GR00T's clients, from a clone of its repository: `--clone PATH`."""
+    """Test with Isaac-GR00T's clients and open loop, from a clone of its repository: `--clone PATH`."""
     working(session).run("tests/compat/groot.py", *session.posargs)
 
 

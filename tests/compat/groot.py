@@ -1,8 +1,8 @@
-"""Runs Isaac-GR00T's released clients, unmodified, against `saccade serve`.
+"""Runs Isaac-GR00T's released clients against `saccade serve`, its open loop against `evaluate`; unmodified.
 
     python tests/compat/groot.py --clone PATH [PATH ...] [--releases n1.5]
 
-Nothing is fetched: the clients are read with `git show` from local clones, at the commits that
+Nothing is fetched: the files are read with `git show` from local clones, at the commits that
 isaac-groot.txt names; `make test-clients CLIENTS_ARGS="--clone PATH"` does the same. The environment is
 `.venv-compat-groot` next to the Makefile. It is created again when its list of packages changes.
 """
@@ -29,16 +29,16 @@ PIP = ("-m", "pip", "--disable-pip-version-check", "--no-input", "install", "--q
 
 @dataclass(frozen=True)
 class Part:
-    """A file of a release. Of a file that imports much else, only the named classes are kept.
+    """A file of a release. Of a file that imports much else, only the named classes and functions are kept.
 
     Attributes:
         path: Its path.
-        classes: The classes, or empty for the whole file.
-        imports: Lines that these classes need.
+        names: The classes and functions, or empty for the whole file.
+        imports: Lines that these need.
     """
 
     path: str
-    classes: tuple[str, ...] = ()
+    names: tuple[str, ...] = ()
     imports: str = ""
 
 
@@ -58,18 +58,47 @@ _BASE = Part(
 )
 _CONFIG = Part("gr00t/data/dataset.py", ("ModalityConfig",), "from pydantic import BaseModel\n")
 
-#: What is read of each release: the client's own files as they are, and what they import.
+_OPEN_LOOP_15 = Part(
+    "gr00t/utils/eval.py",
+    ("calc_mse_for_single_trajectory",),
+    "from __future__ import annotations\nimport numpy as np\n",
+)
+#: The loop with the functions that it calls, and its reader of a step.
+_OPEN_LOOP = (
+    Part(
+        "gr00t/eval/open_loop_eval.py",
+        (
+            "plot_trajectory_results",
+            "parse_observation_gr00t",
+            "parse_action_gr00t",
+            "evaluate_single_trajectory",
+        ),
+        "from __future__ import annotations\nimport logging\n"
+        "from copy import deepcopy\nfrom pathlib import Path\nfrom typing import Any\n"
+        "import numpy as np\nimport pandas as pd\nfrom matplotlib import pyplot as plt\n"
+        "from gr00t.data.dataset.sharded_single_step_dataset import extract_step_data\n",
+    ),
+    Part(
+        "gr00t/data/dataset/sharded_single_step_dataset.py",
+        ("extract_step_data",),
+        "from __future__ import annotations\nimport numpy as np\nfrom gr00t.data.types import VLAStepData\n",
+    ),
+)
+
+#: What is read of each release: the client's own files as they are, and what they import; the open loop.
 RELEASES = {
     "n1": (Part("gr00t/eval/service.py"),),
     "n1.5-early": (Part("gr00t/eval/service.py"),),
-    "n1.5": (Part("gr00t/eval/service.py"), Part("gr00t/eval/robot.py"), _CONFIG, _BASE),
-    "n1.6": _MESSAGES,
-    "n1.7": _MESSAGES,
+    "n1.5": (Part("gr00t/eval/service.py"), Part("gr00t/eval/robot.py"), _CONFIG, _BASE, _OPEN_LOOP_15),
+    "n1.6": (*_MESSAGES, *_OPEN_LOOP),
+    "n1.7": (*_MESSAGES, *_OPEN_LOOP),
 }
+#: The tests.
+TESTS = ("groot_clients.py", "groot_open_loop.py")
 
 
 def main() -> None:
-    """Sets up, reads the clients and runs the tests."""
+    """Sets up, reads the released files and runs the tests."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -82,9 +111,8 @@ def main() -> None:
     paths = os.pathsep.join(map(str, (ROOT / "python", ROOT / "lab", ROOT, HERE)))
     command = [str(FOLDER / "bin" / "python"), "-m", "pytest", "--noconftest", "--quiet"]
     chosen = {"SACCADE_GROOT_SOURCES": str(SOURCES), "SACCADE_GROOT_RELEASES": " ".join(options.releases)}
-    done = subprocess.run(
-        [*command, str(HERE / "groot_clients.py")], cwd=ROOT, env=os.environ | {"PYTHONPATH": paths} | chosen
-    )
+    tests = [str(HERE / name) for name in TESTS]
+    done = subprocess.run([*command, *tests], cwd=ROOT, env=os.environ | {"PYTHONPATH": paths} | chosen)
     sys.exit(done.returncode)
 
 
@@ -100,8 +128,8 @@ def read(release: str, clones: list[Path]) -> None:
     shutil.rmtree(folder, ignore_errors=True)
     for part in RELEASES[release]:
         text = show(f"{commit}:{part.path}", clones)
-        if part.classes:
-            text = part.imports + "\n\n".join(classes(text, part.classes))
+        if part.names:
+            text = part.imports + "\n\n".join(definitions(text, part.names))
         path = folder / part.path
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(text)
@@ -116,9 +144,10 @@ def show(name: str, clones: list[Path]) -> str:
     sys.exit(f"{name}: in none of the clones {', '.join(map(str, clones))}")
 
 
-def classes(text: str, names: tuple[str, ...]) -> list[str]:
-    """The source of classes, as it is."""
-    found = {node.name: node for node in ast.parse(text).body if isinstance(node, ast.ClassDef)}
+def definitions(text: str, names: tuple[str, ...]) -> list[str]:
+    """The source of classes and functions, as it is."""
+    kinds = (ast.ClassDef, ast.FunctionDef)
+    found = {node.name: node for node in ast.parse(text).body if isinstance(node, kinds)}
     return [ast.get_source_segment(text, found[name]) or "" for name in names]
 
 
@@ -127,7 +156,7 @@ def set_up() -> None:
     stamp = FOLDER / "packages.txt"
     if stamp.is_file() and stamp.read_text() == PACKAGES.read_text():
         return
-    print("setup: Isaac-GR00T's clients", flush=True)
+    print("setup: Isaac-GR00T's released code", flush=True)
     subprocess.run([sys.executable, "-m", "venv", "--clear", FOLDER], check=True)
     python = FOLDER / "bin" / "python"
     below, own = (
