@@ -126,7 +126,7 @@ def main() -> None:
                 cameras = [camera.name for camera in settings_of.cameras]
                 fps = SIMULATION_HZ // settings_of.frame_stride
                 write_recordings(
-                    recordings, judged(args.demos, seen), cameras, settings_of.image_size, fps, noise=False
+                    recordings, judged(args.demos, seen), cameras, settings_of.image_size, fps, extra={}
                 )
             name = f"{policy} on recordings of {seen}"
             if name not in found:

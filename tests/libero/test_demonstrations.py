@@ -135,6 +135,7 @@ def test_the_command_records_a_data_set(tmp_path: Path, capsys: pytest.CaptureFi
     actions = data.column(0, "action")
     np.testing.assert_array_equal(actions[:, :6], one.actions[:, :6])
     np.testing.assert_array_equal(actions[:, 6], one.actions[:, 6] < 0)  # 1 is open
+    np.testing.assert_array_equal(data.column(0, "disturbed")[:, 0], one.disturbed)
     assert data.instruction(0, 0) == task.instruction
 
 

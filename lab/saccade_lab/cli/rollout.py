@@ -221,7 +221,7 @@ def prepare(args: argparse.Namespace, seeds: range, workers: Workers) -> Session
 def write_recordings_of(session: Session) -> None:
     """Writes the data set, if one is wanted and there are episodes."""
     from saccade_lab.sim.environment import SIMULATION_HZ
-    from saccade_lab.sim.recordings import Recording, write_recordings
+    from saccade_lab.sim.recordings import NOISE, Recording, write_recordings
 
     folder, config = session.recordings, session.policy.config
     if session.record_to is None or folder is None or not session.done:
@@ -233,7 +233,7 @@ def write_recordings_of(session: Session) -> None:
         [camera.name for camera in config.cameras],
         config.image_size,
         SIMULATION_HZ,
-        noise=True,
+        extra=NOISE,
     )
 
 

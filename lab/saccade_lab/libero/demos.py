@@ -147,7 +147,7 @@ def export(directory: Path, recordings: list[LiberoRecording], count: int, path:
     """Writes the first episodes of a recording as a data set of lerobot's format.
 
     Keys and units are those of ``saccade_lab.libero.checkpoint``. A step is a control step, and its action
-    the expert's, also where another one was executed.
+    the expert's, also where another one was executed: there the column ``disturbed`` is 1.
 
     Args:
         directory: The recording, with an observation for every control step.
@@ -173,9 +173,13 @@ def export(directory: Path, recordings: list[LiberoRecording], count: int, path:
         cameras=dict.fromkeys(CAMERAS, (size, size)),
         state=STATE_GROUPS,
         action=ACTION_GROUPS,
+        extra=demos.DISTURBED,
     ) as writer:
         for instruction, one in episodes():
-            frames = {name: one.images[:, place] for place, name in enumerate(CAMERAS)}
             writer.add_episode(
-                instruction, frames=frames, state=one.proprio, action=policy_actions(one.actions)
+                instruction,
+                frames={name: one.images[:, place] for place, name in enumerate(CAMERAS)},
+                state=one.proprio,
+                action=policy_actions(one.actions),
+                extra=demos.disturbed_column(one),
             )

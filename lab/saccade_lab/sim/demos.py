@@ -35,6 +35,8 @@ if TYPE_CHECKING:
 
 MAX_STEPS = 250  # bursts lengthen the expert's path
 STEPS_AFTER_SUCCESS = 8  # so that the last chunks show how to stay
+#: The column of a data set that says at which steps another action than the recorded one was executed.
+DISTURBED = {"disturbed": 1}
 MAX_MISSES = 0.5  # a task is given up if more than this share of at least 20 episodes fails
 # The success of reach and of the study tasks depends only on the position of the hand. They need the most
 # precision and therefore the most demonstrations.
@@ -377,7 +379,8 @@ def read_settings(directory: Path, tasks: Sequence[str]) -> RecordingSettings:
 def export(directory: Path, counts: Mapping[str, int], path: Path) -> None:
     """Writes the first episodes of a recording as a data set of lerobot's format.
 
-    A step is a control step, and its action the expert's, also where another one was executed.
+    A step is a control step, and its action the expert's, also where another one was executed: there the
+    column ``disturbed`` is 1.
 
     Args:
         directory: The recording, with an observation for every control step.
@@ -393,10 +396,16 @@ def export(directory: Path, counts: Mapping[str, int], path: Path) -> None:
         for task, count in counts.items():
             for seed, one in itertools.islice(episodes(directory, task), count):
                 instruction = find_task(task).instruction(seed)
-                yield Recording(instruction, one.images, one.proprio, one.actions)
+                yield Recording(instruction, one.images, one.proprio, one.actions, disturbed_column(one))
 
     cameras = [camera.name for camera in settings.cameras]
-    write_recordings(path, recordings(), cameras, settings.image_size, SIMULATION_HZ, noise=False)
+    write_recordings(path, recordings(), cameras, settings.image_size, SIMULATION_HZ, extra=DISTURBED)
+
+
+def disturbed_column(demonstration: Demonstration) -> dict[str, npt.NDArray[np.int64]]:
+    """The column ``DISTURBED`` of an episode: ``(steps, 1)``, 1 where another action was executed."""
+    (name,) = DISTURBED
+    return {name: demonstration.disturbed[:, None].astype(np.int64)}
 
 
 def episodes(directory: Path, task: str, *, images: bool = True) -> Iterator[tuple[int, Demonstration]]:

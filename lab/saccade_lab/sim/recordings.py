@@ -90,7 +90,13 @@ class Recorder:
 
 
 def write_recordings(
-    path: Path, recordings: Iterable[Recording], cameras: list[str], image_size: int, fps: int, *, noise: bool
+    path: Path,
+    recordings: Iterable[Recording],
+    cameras: list[str],
+    image_size: int,
+    fps: int,
+    *,
+    extra: Mapping[str, int],
 ) -> None:
     """Writes a data set with these episodes, in their order, all or nothing.
 
@@ -100,7 +106,7 @@ def write_recordings(
         cameras: Names of the cameras, in the order of the images.
         image_size: Pixels along each side.
         fps: Control steps per second.
-        noise: Whether the episodes have the columns of ``NOISE``.
+        extra: Number of values by the name of each further column, which all episodes have.
 
     Raises:
         InputError: There is something in ``path``, or there is no episode.
@@ -113,7 +119,7 @@ def write_recordings(
         cameras=dict.fromkeys(cameras, (image_size, image_size)),
         state=GROUPS,
         action=GROUPS,
-        extra=NOISE if noise else None,
+        extra=extra,
     ) as writer:
         for one in recordings:
             frames = {name: one.images[:, place] for place, name in enumerate(cameras)}

@@ -71,6 +71,8 @@ def test_demonstrations(tmp_path: Path) -> None:
         assert data.episodes[episode].length == len(one.actions)
         np.testing.assert_array_equal(data.column(episode, "action"), one.actions)
         np.testing.assert_array_equal(data.column(episode, "observation.state"), one.proprio)
+        assert one.disturbed.any()
+        np.testing.assert_array_equal(data.column(episode, "disturbed")[:, 0], one.disturbed)
         for step in (0, len(one.actions) - 1):
             for place, camera in enumerate(data.cameras):
                 np.testing.assert_array_equal(
