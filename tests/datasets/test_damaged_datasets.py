@@ -108,6 +108,12 @@ OPENING: list[tuple[str, Change, str]] = [
     ("v3.0", edited("meta/info.json", setting("total_frames", 7)), "total_frames: expected"),
     (
         "v2.1",
+        lines("meta/tasks.jsonl", lambda rows: rows[:1]),
+        "total_tasks: expected 1, those of its list of tasks, got 2",
+    ),
+    ("v3.0", edited("meta/info.json", setting("total_tasks", 3)), "total_tasks: expected 2, .*, got 3"),
+    (
+        "v2.1",
         lines("meta/episodes_stats.jsonl", lambda rows: rows[:2]),
         "expected the statistics of every episode, got none of 2",
     ),

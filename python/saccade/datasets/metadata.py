@@ -123,7 +123,7 @@ class Info:
         return found
 
     def _check(self, tasks: Mapping[int, str], episodes: tuple[Episode, ...]) -> None:
-        """Episodes are those that ``info.json`` counts, each once, and their files exist."""
+        """Tasks and episodes are as many as ``info.json`` counts, each once, and the files exist."""
         total = self.values.get("total_episodes")
         if total is not None and total != len(episodes):
             raise DatasetError(
@@ -135,6 +135,12 @@ class Info:
         if frames is not None and frames != steps:
             raise DatasetError(
                 f"{self.where}: total_frames: expected {steps}, those of its episodes, got {frames!r:.60}"
+            )
+        counted = self.values.get("total_tasks")
+        if counted is not None and counted != len(tasks):
+            raise DatasetError(
+                f"{self.where}: total_tasks: expected {len(tasks)}, those of its list of tasks, got "
+                f"{counted!r:.60}"
             )
         seen: set[int] = set()
         there: set[str] = set()
