@@ -17,6 +17,7 @@ from saccade_lab.recordings.baselines import baselines_by_step
 
 RECORDED, PREDICTED, SOFT = "#000000", "#d55e00", "#0072b2"
 COLUMNS = 4  # joints side by side
+BASELINES = {"hold": ":", "mean": "--", "noise": "-."}
 KINDS = {"main": "#d55e00", "natural": "#0072b2", "removal": "#999999"}
 
 
@@ -61,8 +62,8 @@ def by_step(report: Evaluation) -> Figure:
     axes.plot(steps, [one.mse for _, one in known], color=SOFT, label="policy")
     for name, errors in baselines_by_step(report).items():
         baseline = [errors[step] for step in steps]
-        axes.plot(steps, baseline, color="0.5", linewidth=0.8, linestyle=":", label=name)
-        axes.annotate(name, (steps[-1], baseline[-1]), fontsize=7, color="0.35", va="bottom", ha="right")
+        axes.plot(steps, baseline, color="0.35", linewidth=0.9, linestyle=BASELINES[name], label=name)
+    axes.legend(fontsize=7, frameon=False, ncols=4, loc="lower right", bbox_to_anchor=(1, 1))
     axes.set_xlabel("step of the horizon")
     axes.set_ylabel("MSE")
     axes.set_ylim(bottom=0)
