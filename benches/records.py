@@ -29,6 +29,7 @@ COMMANDS = {
     "parity": "parity --num-threads 1",
     "precision-bfloat16": f"{PARITY} --precision bfloat16",
     "precision-int8": f"{PARITY} --precision int8",
+    "precision-int4": f"{PARITY} --precision int4",
     "simulation-rust": f"{ROLLOUT} --engine rust",
     "simulation-torch": f"{ROLLOUT} --engine torch",
 }

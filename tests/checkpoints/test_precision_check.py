@@ -109,6 +109,7 @@ def test_the_smallest_that_is_close_is_recommended() -> None:
     assert recommended([*rows[:2], row("int8", 0.01, 100)]) == "int8"
     assert recommended([rows[0], rows[2]]) == "float32"
     assert recommended([rows[0], row("int8", float("nan"), 100)]) == "float32"
+    assert recommended([*rows, row("int4", 0.0, 50)]) == "bfloat16"  # no closed loop was run with it
 
 
 def test_the_command(frames: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -35,6 +35,9 @@ PRECISIONS: Mapping[str, Mapping[str, str]] = MappingProxyType(
 #: excluded that int8 costs 2 points of success (docs/precision.md). Nothing larger was tested in closed loop.
 TOLERANCE = 0.01
 
+#: Precisions that are compared and not recommended, however close they are: no closed loop was run with them.
+UNTRIED = ("int4",)
+
 #: Number of chunks that are compared for each observation, from different noise.
 NUM_SAMPLES = 4
 
@@ -89,7 +92,7 @@ class PrecisionCheck:
     tolerance: float
     recommended: str
     """The name of the precision with the smallest weights among those whose actions differ by at most
-    ``tolerance`` of the range."""
+    ``tolerance`` of the range. Never int4, with which no closed loop was run."""
 
 
 @dataclass(frozen=True)
@@ -190,8 +193,8 @@ def check_precisions(
 
 
 def recommended(found: Sequence[PrecisionError]) -> str:
-    """The name of the smallest precision whose actions differ by at most `TOLERANCE` of the range."""
-    close = [one for one in found if one.actions.worst <= TOLERANCE]
+    """The name of the smallest whose actions differ by at most `TOLERANCE` of the range, and was tried."""
+    close = [one for one in found if one.actions.worst <= TOLERANCE and one.name not in UNTRIED]
     return min(close, key=lambda one: one.nbytes).name
 
 

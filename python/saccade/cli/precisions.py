@@ -44,7 +44,7 @@ def run(args: argparse.Namespace) -> int:
     show([overview(found), by_key(found)])
     print(
         f"recommended: {found.recommended}, the smallest whose actions differ by at most "
-        f"{found.tolerance:.0%} of their range"
+        f"{found.tolerance:.0%} of their range (int4 is not: no closed loop was run with it)"
     )
     return EXIT_OK
 
