@@ -90,13 +90,14 @@ def _bundled(work: Path) -> Model:
         )
     policy = Policy.from_pretrained(checkpoint)
     data = fitted(policy, open_recordings(recordings))
-    both = SpacedObservations(policy, data, CALIBRATED + MEASURED)
-    held_out = range(2, len(both), (CALIBRATED + MEASURED) // MEASURED)
+    both = SpacedObservations(policy, data, 2 * (CALIBRATED + MEASURED))
+    held_out = [one for one, (episode, _) in zip(both, both.places, strict=True) if episode % 3 == 0]
+    others = [one for one, (episode, _) in zip(both, both.places, strict=True) if episode % 3]
     return Model(
         "the bundled policy, its own episodes",
         checkpoint,
-        [both[place] for place in range(len(both)) if place not in held_out],
-        [both[place] for place in held_out],
+        others[:: max(1, len(others) // CALIBRATED)],
+        held_out[:: max(1, len(held_out) // MEASURED)],
     )
 
 
@@ -143,6 +144,7 @@ def copies(model: Model, work: Path) -> dict[str, Path]:
     folders = {"int4": work / "plain", "int4, calibrated": work / "calibrated"}
     for folder in folders.values():  # that of the model before has other files
         shutil.rmtree(folder, ignore_errors=True)
+        shutil.rmtree(folder.with_name(f"{folder.name}.calibrating"), ignore_errors=True)
     quantize(model.checkpoint, folders["int4"], to="int4")
     given = Calibration(model.policy(), model.calibrated)
     quantize(model.checkpoint, folders["int4, calibrated"], to="int4", calibration=given)
@@ -153,7 +155,8 @@ def measure(model: Model, folders: dict[str, Path], note: Note) -> dict[str, Any
     """The errors of actions and features by precision, and of float32 from other noise."""
     exact = model.policy()
     actions, features = actions_of(exact, model.measured), features_of(exact, model.measured)
-    other = np.roll(actions, 1, axis=1)  # of the same observation, another sample
+    other = np.roll(actions, 1, axis=2)  # of the same observation, another sample
+    assert not np.array_equal(other, actions)
     found: dict[str, Any] = {"other noise": {"actions": error(other, actions), "features": 0.0}}
     runs: dict[str, tuple[Path | None, str]] = {"bfloat16": (None, "bfloat16"), "int8": (None, "int8")}
     runs |= {name: (folder, "int4") for name, folder in folders.items()}

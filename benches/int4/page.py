@@ -11,9 +11,9 @@ RUNS = ("bfloat16", "int8", "int4", "int4, calibrated")
 ABOUT = """\
 Errors are differences from float32 on the same noise, as the root of the sum of squares relative to that of
 float32: of normalised actions, and of the backbone's features. Calibrated weights were rounded for other
-observations than those that errors are measured on. Random models have planted outliers where trained ones
-have them (`saccade_lab.random_checkpoint`), and their images are random. "× int8" is the error of the
-actions over that of int8."""
+observations than those that errors are measured on, of the bundled policy in other episodes. Random models
+have planted outliers where trained ones have them (`saccade_lab.random_checkpoint`), and their images are
+random. "× int8" is the error of the actions over that of int8."""
 
 ABOUT_GROUPS = """\
 Errors of actions if the weights of one group of layers are rounded to four bits, and all others and all

@@ -22,15 +22,13 @@ def measure(checkpoint: Path, work: Path, threads: int, note: Note) -> dict[str,
         `benches.backbone.memory.measure` returns it.
     """
     one = work / "one-embodiment"
-    if not one.is_dir():
-        kept = saccade.Normalizer.from_pretrained(checkpoint).embodiment_id
-        convert(checkpoint, one, embodiment_ids=None if kept is None else [kept])
+    kept = saccade.Normalizer.from_pretrained(checkpoint).embodiment_id
+    convert(checkpoint, one, embodiment_ids=None if kept is None else [kept], force=True)
     found: dict[str, Any] = {}
     for precision in ("int8", "int4"):
         folder = work / precision
-        if not folder.is_dir():
-            note(f"writing {precision}")
-            quantize(one, folder, to=precision)
+        note(f"writing {precision}")
+        quantize(one, folder, to=precision, force=True)
         # The layers of other embodiments are holes.
         files = [path.stat() for path in folder.glob("*.safetensors")]
         found[precision] = {"file_bytes": sum(512 * file.st_blocks for file in files), "loads": []}

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import pytest
+from PIL import Image
 
 import saccade
 from saccade import InputError, Policy, cli
@@ -22,6 +23,7 @@ from tests.helpers.recorded_folder import written
 from tests.helpers.whole_checkpoints import EMBODIMENT, whole
 
 DEMO = saccade.demo_checkpoint()
+IMAGES = ("--to", "int4", "--instruction", "push", "--calibrate")
 
 
 def examples(policy: Policy, count: int) -> list[dict[str, Any]]:
@@ -105,7 +107,7 @@ def test_an_interrupted_run_goes_on(
         InputError, match=r"out.calibrating: has results with other settings \(seed changed\)"
     ):
         quantize(DEMO, out, to="int4", calibration=Calibration(policy, examples(policy, 3), seed=1))
-    with pytest.raises(InputError, match=r"\(observations, observations_sha256 changed\)"):
+    with pytest.raises(InputError, match=r"\(observations, inputs_sha256 changed\)"):
         quantize(DEMO, out, to="int4", calibration=Calibration(policy, examples(policy, 2)))
     given = Calibration(policy, examples(policy, 3))
     with pytest.raises(InputError, match=r"\(parts changed\)"):
@@ -164,6 +166,11 @@ def test_what_is_wrong_is_named(tmp_path: Path) -> None:
     refused(InputError, "policy: expected a saccade.Policy, got str", Calibration("demo", one))  # type: ignore[arg-type]
     other = Policy.from_pretrained(whole("isaac"), embodiment=EMBODIMENT, num_threads=1)
     refused(InputError, "policy: expected the policy of", Calibration(other, one))
+    refused(InputError, "expected a saccade.checkpoints.Calibration, got list", one)  # type: ignore[arg-type]
+    some = (observation for observation in one)
+    refused(InputError, "expected a sequence, got generator", Calibration(policy, some))  # type: ignore[arg-type]
+    refused(InputError, "seed: expected at least 0, got -1", Calibration(policy, one, seed=-1))
+    refused(InputError, "config: expected None with calibration", plain, config=DEMO / "config.json")
     taken = tmp_path / "taken"
     taken.mkdir()
     (taken / "thesis.txt").write_text("all of it")
@@ -172,6 +179,55 @@ def test_what_is_wrong_is_named(tmp_path: Path) -> None:
     assert (taken / "thesis.txt").read_text() == "all of it"
     bad = dict(one[0], video={})
     refused(SaccadeError, "video", Calibration(policy, [bad]))
+
+
+def test_a_folder_of_somebody_else_is_not_touched(tmp_path: Path) -> None:
+    policy, kept = demo_policy(), tmp_path / "out.calibrating"
+    kept.mkdir()
+    (kept / "thesis.txt").write_text("all of it")
+    given = Calibration(policy, examples(policy, 1))
+    with pytest.raises(InputError, match=r"got one with thesis.txt and without settings.json"):
+        quantize(DEMO, tmp_path / "out", to="int4", calibration=given)
+    assert [path.name for path in kept.iterdir()] == ["thesis.txt"]
+    # Nor is it a calibration because somebody has such settings.
+    (kept / "settings.json").write_text("{}")
+    with pytest.raises(InputError, match="has results with other settings"):
+        quantize(DEMO, tmp_path / "out", to="int4", calibration=given)
+    assert (kept / "thesis.txt").read_text() == "all of it"
+
+
+def test_what_an_earlier_run_left(
+    whole_run: tuple[Path, QuantizeReport], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A run without a layer is nobody's, a damaged layer is rounded again, and a slash at the end is none."""
+    policy = demo_policy()
+    kept = tmp_path / "out.calibrating"
+
+    def stop(done: int, total: int) -> None:
+        raise ZeroDivisionError
+
+    given = Calibration(policy, examples(policy, 1), seed=5, progress=stop)
+    with pytest.raises(ZeroDivisionError):
+        quantize(DEMO, tmp_path / "out", to="int4", calibration=given)
+    assert [path.name for path in kept.iterdir()] == ["settings.json"]
+
+    monkeypatch.setattr(calibration, "GROUP_BYTES", 300_000)
+    count = iter(range(40))
+
+    def later(done: int, total: int) -> None:
+        if next(count, None) is None:
+            raise ZeroDivisionError
+
+    observations = examples(policy, 3)
+    given = Calibration(policy, observations, progress=later)
+    with pytest.raises(ZeroDivisionError):
+        quantize(DEMO, f"{tmp_path}/out/", to="int4", calibration=given)
+    first, second, *_ = sorted(path for path in kept.iterdir() if path.is_dir())
+    (first / "model.safetensors").write_bytes(b"half")
+    (second / "model.safetensors").unlink()
+    quantize(DEMO, f"{tmp_path}/out/", to="int4", calibration=Calibration(policy, observations))
+    assert contents(tmp_path / "out") == contents(whole_run[0])
+    assert not kept.exists()
 
 
 def run(*arguments: Any) -> int:
@@ -185,7 +241,7 @@ def test_the_command_on_a_data_set(tmp_path: Path, capsys: pytest.CaptureFixture
     options = ("--to", "int4", "--calibrate", folder, "--observations", 4, "--num-threads", 1)
     assert run("quantize", DEMO, "--out", out, *options) == 0
     shown = capsys.readouterr().out
-    assert "weights were rounded for the observations; outputs of their layers" in shown
+    assert "weights were rounded for 4 observations; on these the outputs of their layers differ" in shown
     assert run("inspect", out) == 0
     assert "rounded for what the layers are given on 4 observations (GPTQ)" in capsys.readouterr().out
     # 22 steps in all: the middles of four equal parts.
@@ -198,15 +254,16 @@ def test_the_command_on_a_data_set(tmp_path: Path, capsys: pytest.CaptureFixture
 
 
 def test_the_command_on_images(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    image = pytest.importorskip("PIL.Image")
     policy = demo_policy()
     frames = tmp_path / "frames"
     seen = examples(policy, 2)
     for index, observation in enumerate(seen):
         (frames / str(index)).mkdir(parents=True)
         for name, video in observation["video"].items():
-            image.fromarray(video[0, -1]).save(frames / str(index) / f"{name}.png")
+            Image.fromarray(video[0, -1]).save(frames / str(index) / f"{name}.png")
         observation["language"] = {key: [["push the cube"]] for key in observation["language"]}
+        state = {key: values[0, -1].tolist() for key, values in observation["state"].items()}
+        (frames / str(index) / "state.json").write_text(json.dumps(state))
     options = ("--to", "int4", "--calibrate", frames, "--instruction", "push the cube", "--json")
     assert run("quantize", DEMO, "--out", tmp_path / "out", *options, "--seed", 3) == 0
     report = json.loads(capsys.readouterr().out)
@@ -223,8 +280,11 @@ def test_the_command_on_images(tmp_path: Path, capsys: pytest.CaptureFixture[str
         (["--calibrate", "frames"], "--calibrate: only with --to int4, given int8"),
         (["--to", "int4", "--calibrate", "{data}", "--state", "s.json"], "--state: not with --calibrate"),
         (["--to", "int4", "--calibrate", "{images}", "--observations", "3"], "--observations: not with"),
-        (["--to", "int4", "--calibrate", "{images}"], "expected pictures named after the cameras"),
-        (["--to", "int4", "--calibrate", "no/such/folder"], "no such directory"),
+        (["--to", "int4", "--calibrate", "{images}"], "--instruction: expected what the robot is told"),
+        ([*IMAGES, "{images}"], "expected pictures named after the cameras"),
+        ([*IMAGES, "{stateless}"], "--state: expected the robot's state, since"),
+        ([*IMAGES, "no/such/folder"], "no such directory"),
+        ([*IMAGES, "{images}", "--config", "config.json"], "--config: not with --calibrate"),
     ],
 )
 def test_bad_arguments_of_the_command(
@@ -232,7 +292,11 @@ def test_bad_arguments_of_the_command(
 ) -> None:
     (tmp_path / "data" / "meta").mkdir(parents=True)
     (tmp_path / "images").mkdir()
-    places = {"data": tmp_path / "data", "images": tmp_path / "images"}
+    stateless = tmp_path / "stateless"
+    stateless.mkdir()
+    for name, video in demo_policy().example_observation()["video"].items():
+        Image.fromarray(video[0, -1]).save(stateless / f"{name}.png")
+    places = {"data": tmp_path / "data", "images": tmp_path / "images", "stateless": stateless}
     given = [argument.format(**places) for argument in arguments]
     assert run("quantize", DEMO, "--out", tmp_path / "out", *given) == 2
     assert message in capsys.readouterr().err

@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import os
+import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
+import numpy.typing as npt
 
 import saccade._saccade as _saccade
-from saccade._internal.run_settings import begin
+from saccade._internal import run_settings
+from saccade._internal.arrays import Float32Array, integer
 from saccade.backbone.backbone import Backbone
-from saccade.backbone.features import BackboneFeatures
-from saccade.errors import InputError
+from saccade.errors import CheckpointError, InputError
 from saccade.head.head import ActionHead
 from saccade.observations import ParsedObservation
 from saccade.policy.encoding import compute_features, encode_features
@@ -24,9 +27,13 @@ from saccade.policy.preparing import prepare_inputs
 from saccade.policy.reading import Observation, read_observations
 from saccade.processor import Processor
 
+if TYPE_CHECKING:
+    from saccade.backbone.features import BackboneFeatures
+
 #: Gram matrices that are held together, in bytes. All observations are run once for each such group of
 #: layers. All matrices of N1.5 take 9 GB.
 GROUP_BYTES = 1 << 30
+SETTINGS = "settings.json"
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,9 +94,7 @@ class Rounded:
 
     Attributes:
         directories: Where their weights are.
-        errors: By the name of a layer's first weight, sums over its outputs: their squared error if weights
-            are rounded each for itself (``plain``) and as they are (``rounded``), and their squares
-            (``outputs``).
+        errors: By the name of a layer's first weight; see :class:`saccade.checkpoints.QuantizeReport`.
         note: What the files of the copy say of the calibration.
     """
 
@@ -109,39 +114,42 @@ def round_layers(given: Calibration, rewrite: Mapping[str, Any], folder: Path) -
         folder: The folder.
 
     Raises:
-        InputError: The policy is not that of the source in float32, there are no observations, or the folder
-            has layers of another calibration.
+        InputError: The policy is not that of the source in float32, there are no observations, they do not
+            run all layers, or the folder has other files or layers of another calibration.
         ShapeError, DtypeError: An observation does not fit the policy.
     """
     runs = _Runs(given, Path(rewrite["source"]))
-    head = given.policy.head
-    assert isinstance(head, ActionHead)
+    head = runs.head
     head_prefix, backbone_prefix, names = _saccade.quantized_weights(dict(rewrite))
     note = {
         "observations": len(given.observations),
-        "observations_sha256": runs.digest(),
+        "inputs_sha256": runs.digest(),
         "seed": given.seed,
         "embodiment_id": given.policy.embodiment_id,
     }
+    prefixes = {"backbone": backbone_prefix, "head": head_prefix}
     settings = {
         **note,
         "source_sha256": rewrite["metadata"]["source_sha256"],
-        "parts": ["head"] if backbone_prefix is None else ["backbone", "head"],
+        "action_horizon": head.config.action_horizon,
+        "parts": [part for part, prefix in prefixes.items() if prefix is not None],
         "saccade": _saccade.__version__,
         "instruction_set": head.isa,
     }
-    folder.mkdir(parents=True, exist_ok=True)
-    begin(folder / "settings.json", settings, folder)
-
-    prefixes = {"backbone": backbone_prefix, "head": head_prefix}
+    _begin(folder, settings)
     parts = {
         part: list(_layers(runs.watch(part, [], 1), prefix, names))
         for part, prefix in prefixes.items()
         if prefix is not None
     }
+    run = {name for layers in parts.values() for layer in layers for name in layer.weights}
+    if run != names:
+        raise InputError(
+            "calibration: expected observations that all layers are run on, got none for "
+            f"{', '.join(sorted(names - run))[:200]}"
+        )
     todo = {
-        part: [layer for layer in layers if not layer.directory(folder).is_dir()]
-        for part, layers in parts.items()
+        part: [layer for layer in layers if not _is_finished(layer, folder)] for part, layers in parts.items()
     }
     passes = [(part, group) for part, layers in todo.items() for group in _groups(layers)]
     steps = _Steps(given, len(passes), sum(map(len, todo.values())))
@@ -152,17 +160,52 @@ def round_layers(given: Calibration, rewrite: Mapping[str, Any], folder: Path) -
         grams = {weights[0]: gram for weights, _, gram in seen if gram is not None}
         del seen
         for layer in group:
-            _saccade.round_layer(
-                published,
-                list(layer.weights),
-                grams.pop(layer.watched),
-                os.fspath(layer.directory(folder)),
-                head.num_threads,
-            )
+            directory = os.fspath(layer.directory(folder))
+            gram = grams.pop(layer.watched)
+            _saccade.round_layer(published, list(layer.weights), gram, directory, head.num_threads)
             steps.add()
     rounded = [layer.directory(folder) for layers in parts.values() for layer in layers]
     errors = {path.name: _saccade.rounded_layer(os.fspath(path))[1] for path in rounded}
     return Rounded(tuple(rounded), errors, note)
+
+
+def remove(rounded: Rounded, folder: Path) -> None:
+    """Removes the layers of a folder, then its settings, and the folder if nothing else is in it."""
+    for directory in rounded.directories:
+        shutil.rmtree(directory)
+    (folder / SETTINGS).unlink()
+    with contextlib.suppress(OSError):  # a file of somebody else
+        folder.rmdir()
+
+
+def _begin(folder: Path, settings: Mapping[str, Any]) -> None:
+    """Makes the folder, or checks that it belongs to this calibration."""
+    file = folder / SETTINGS
+    there = sorted(folder.iterdir()) if folder.is_dir() else []
+    if there and not file.is_file():
+        raise InputError(
+            f"{folder}: expected no such folder or one of a calibration, got one with {there[0].name} and "
+            f"without {SETTINGS}"
+        )
+    folder.mkdir(parents=True, exist_ok=True)
+    if there == [file]:  # no layer was finished
+        file.unlink()
+    run_settings.begin(file, settings, folder)
+
+
+def _is_finished(layer: Layer, folder: Path) -> bool:
+    """Whether a layer is in the folder; one that is damaged is removed."""
+    directory = layer.directory(folder)
+    if not directory.is_dir():
+        return False
+    try:
+        names, _ = _saccade.rounded_layer(os.fspath(directory))
+    except (CheckpointError, FileNotFoundError):
+        names = []
+    if set(names) == set(layer.weights):
+        return True
+    shutil.rmtree(directory)
+    return False
 
 
 class _Steps:
@@ -183,46 +226,64 @@ class _Steps:
             self._progress(self._done, self._total)
 
 
-@dataclass(eq=False)
+@dataclass(frozen=True, eq=False)
+class _Features:
+    """What the head takes of an observation. All that a backbone keeps would be ten times as much."""
+
+    backbone_features: Float32Array
+    image_mask: npt.NDArray[np.bool_]
+
+
 class _Runs:
-    """Runs the parts of a policy on observations, watched."""
+    """Runs the parts of a policy on observations, watched.
 
-    given: Calibration
-    source: Path
-    #: What the backbone made of each observation, once it was run.
-    features: dict[int, tuple[BackboneFeatures, ...]] = field(default_factory=dict)
+    Args:
+        given: The observations.
+        source: The checkpoint that is quantised.
+    """
 
-    def __post_init__(self) -> None:
-        policy = self.given.policy
+    def __init__(self, given: Calibration, source: Path) -> None:
+        policy = given.policy
         if not isinstance(policy, Policy):
             raise InputError(f"calibration: policy: expected a saccade.Policy, got {type(policy).__name__}")
-        parts = {"processor": Processor, "backbone": Backbone, "head": ActionHead}
-        for name, kind in parts.items():
+        for name, kind in (("processor", Processor), ("backbone", Backbone), ("head", ActionHead)):
             if not isinstance(getattr(policy, name), kind):
                 raise InputError(f"calibration: policy: expected saccade's own {name}, got {policy!r:.80}")
+        assert isinstance(policy.processor, Processor)
+        assert isinstance(policy.backbone, Backbone)
+        assert isinstance(policy.head, ActionHead)
         for model in (policy.backbone, policy.head):
-            assert isinstance(model, Backbone | ActionHead)
             if model.precision != "float32":
                 raise InputError(f"calibration: policy: expected one in float32, got {model.precision}")
-            if model.source is None or Path(model.source).resolve() != self.source.resolve():
+            if model.source is None or Path(model.source).resolve() != source.resolve():
                 raise InputError(
-                    f"calibration: policy: expected the policy of {self.source}, got that of {model.source}"
+                    f"calibration: policy: expected the policy of {source}, got that of {model.source}"
                 )
-        if len(self.given.observations) == 0:
+        observations: Any = given.observations
+        if not isinstance(observations, Sequence):
+            kind_of = type(observations).__name__
+            raise InputError(f"calibration: observations: expected a sequence, got {kind_of}")
+        if len(observations) == 0:
             raise InputError("calibration: observations: expected at least one, got none")
+        integer("calibration: seed", given.seed, least=0)
+        self.given, self.policy = given, policy
+        self.processor, self.backbone, self.head = policy.processor, policy.backbone, policy.head
+        self._features: dict[int, tuple[_Features, ...]] = {}
 
     def digest(self) -> str:
-        """SHA-256 of all observations, as the policy reads them."""
+        """SHA-256 of what the models are given: pixels, tokens and normalised states."""
         found = hashlib.sha256()
         for given in self.given.observations:
-            for parsed in read_observations(given, self.given.policy.requirements):
-                for frames, instruction in zip(parsed.frames, parsed.instructions, strict=True):
-                    for name, frame in frames.items():
-                        found.update(f"{name} {frame.shape}\n".encode())
-                        found.update(np.ascontiguousarray(frame).tobytes())
-                    found.update(f"{instruction!r} {parsed.is_plain}\n".encode())
-                found.update(f"{parsed.state.shape}\n".encode())
-                found.update(np.ascontiguousarray(parsed.state).tobytes())
+            parsed = read_observations(given, self.policy.requirements)
+            arrays: list[Any] = [self.policy.normalizer.state(parsed.state)]
+            for inputs in prepare_inputs(parsed, self.processor):
+                pixels = inputs.pixel_values
+                arrays += [*(pixels if isinstance(pixels, tuple) else (pixels,))]
+                arrays += [inputs.input_ids, inputs.attention_mask, inputs.image_grid_thw]
+            for array in arrays:
+                values = np.ascontiguousarray(() if array is None else array)
+                found.update(f"{values.dtype} {values.shape}\n".encode())
+                found.update(values.tobytes())
         return found.hexdigest()
 
     def watch(
@@ -231,11 +292,11 @@ class _Runs:
         """The layers that the first ``count`` observations run, with what those wanted are given."""
         if part == "head":
             for index in range(count):
-                self._encode(index)
+                if index not in self._features:
+                    self._encode(index)
         with _saccade.watch_linears(list(wanted)) as watched:
             for index in range(count):
                 if part == "backbone":
-                    self.features.pop(index, None)
                     self._encode(index)
                 else:
                     self._denoise(index)
@@ -243,18 +304,16 @@ class _Runs:
         return watched.layers()
 
     def _encode(self, index: int) -> None:
-        policy = self.given.policy
-        if index in self.features:
-            return
-        assert policy.processor is not None
-        assert policy.backbone is not None
-        parsed = read_observations(self.given.observations[index], policy.requirements)
-        self.features[index] = compute_features(prepare_inputs(parsed, policy.processor), policy.backbone)
+        parsed = read_observations(self.given.observations[index], self.policy.requirements)
+        features = compute_features(prepare_inputs(parsed, self.processor), self.backbone)
+        self._features[index] = tuple(
+            _Features(np.array(one.backbone_features), np.array(one.image_mask)) for one in features
+        )
 
     def _denoise(self, index: int) -> None:
-        policy = self.given.policy
-        context = encode_features(self.features[index], policy.head)
-        policy.sample(context, self.given.observations[index], seed=self.given.seed + index)
+        features = cast("tuple[BackboneFeatures, ...]", self._features[index])
+        context = encode_features(features, self.head)
+        self.policy.sample(context, self.given.observations[index], seed=self.given.seed + index)
 
 
 def _layers(

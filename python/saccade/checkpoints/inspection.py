@@ -110,14 +110,20 @@ def inspect(
 
 def _rounding(description: Description, calibration: str | None) -> str | None:
     """How int4 weights were rounded, by what the files say of it."""
-    if not any(tensor.dtype == "U8" for tensor in description.tensors):
+    names = {tensor.name for tensor in description.tensors}
+    if not any(tensor.dtype == "U8" and f"{tensor.name}_scale" in names for tensor in description.tensors):
         return None
     if calibration is None:
         return "each weight to the nearest, without calibration"
     try:
         count = json.loads(calibration)["observations"]
     except (ValueError, RecursionError, KeyError, TypeError):
-        raise CheckpointError(f"source: {CALIBRATION} in the metadata is {calibration!r:.80}") from None
+        count = None
+    if type(count) is not int:
+        raise CheckpointError(
+            f"source: {CALIBRATION} in the metadata: expected a number of observations, got "
+            f"{calibration!r:.80}"
+        )
     return f"for what the layers are given on {count} observations (GPTQ)"
 
 

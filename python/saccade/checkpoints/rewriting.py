@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,7 +14,7 @@ from saccade._internal.arrays import integer, optional_integers, text
 from saccade._internal.files import sha256_of
 from saccade._internal.hub import resolve
 from saccade._internal.hub_files import WHOLE
-from saccade.checkpoints.calibration import Calibration, round_layers
+from saccade.checkpoints.calibration import Calibration, remove, round_layers
 from saccade.checkpoints.description import CALIBRATION, Config, Source
 from saccade.errors import InputError
 from saccade.head.config import to_json
@@ -48,8 +47,10 @@ class QuantizeReport(Written):
     """How many of them were rounded for the observations of a calibration."""
     rounding: Mapping[str, Mapping[str, float]] | None
     """What rounding changed in each layer, by the name of its first weight; None without calibration. Sums
-    over its outputs on the observations: their squared error if each weight were rounded to the nearest
-    (``plain``) and as they were rounded (``rounded``), and their squares (``outputs``)."""
+    over its outputs on the observations of the calibration: their squared error if each weight were rounded
+    to the nearest (``plain``) and as they were rounded (``rounded``), and their squares (``outputs``). Each
+    counts what the rounding minimises: a hundredth of the square of each input for itself besides, and 1 for
+    an input that was always zero."""
     num_copied: int
     """Number of tensors that were copied bit for bit."""
     head_bytes_before: int
@@ -152,7 +153,8 @@ def quantize(
     are those that the integers represent, rounded again if that precision rounds weights. No other program
     reads these weights.
 
-    One tensor at a time is in memory. The directory appears under its name when everything is written.
+    Without calibration one tensor at a time is in memory. The directory appears under its name when
+    everything is written.
 
     Args:
         source: A directory (``config.json`` and one or more ``.safetensors`` files) or one ``.safetensors``
@@ -162,9 +164,11 @@ def quantize(
         config: As for :meth:`saccade.ActionHead.from_pretrained`. It becomes the ``config.json`` of the copy.
         head_only: Whether to leave out tensors outside the head.
         keep_backbone: Whether to copy the tensors of a backbone bit for bit.
-        calibration: Observations for which int4 weights are rounded. It takes minutes for small policies and
-            hours for the published ones, mostly to run the observations. Finished layers are kept in
-            ``OUT.calibrating`` until the copy is written, and a call that was interrupted goes on with them.
+        calibration: Observations for which int4 weights are rounded. All of them are run in float32, once for
+            each GiB of the layers' Gram matrices (9 for N1.5), whose time was not measured. In memory are the
+            policy, one such GiB, the factor of the largest matrix in float64 (half a GiB for 8192 inputs) and
+            the features of all observations. Finished layers are kept in ``OUT.calibrating`` until the copy
+            is written, and a call that was interrupted goes on with them.
         force: Whether to replace an existing checkpoint. A directory that contains other files is never
             replaced.
         progress: Called after each tensor with the number of bytes that are done and the total number of
@@ -176,7 +180,8 @@ def quantize(
             or infinity. Or ``out`` cannot be written.
         InputError: ``to`` is another precision, ``out`` exists and ``force`` is not set, or it contains other
             files or the source. Or ``calibration`` is given with int8, its policy is not that of the source
-            in float32, or ``OUT.calibrating`` belongs to another calibration.
+            in float32, its observations do not run all layers, ``config`` is given too, or
+            ``OUT.calibrating`` has other files or layers of another calibration.
         ShapeError, DtypeError: An observation does not fit the policy.
 
     Example:
@@ -194,12 +199,19 @@ def quantize(
         return QuantizeReport(**_frozen(_saccade.quantize(rewrite, text("to", to))), rounding=None)
     if to != "int4":
         raise InputError(f"calibration: expected None unless to is 'int4', got to={to!r}")
-    kept = Path(f"{os.fspath(out)}.calibrating")
+    if not isinstance(calibration, Calibration):
+        raise InputError(
+            f"calibration: expected a saccade.checkpoints.Calibration, got {type(calibration).__name__}"
+        )
+    if config is not None:
+        raise InputError("config: expected None with calibration, whose policy has that of the source")
+    folder = Path(rewrite["out"])
+    kept = folder.with_name(f"{folder.name}.calibrating")
     rounded = round_layers(calibration, rewrite, kept)
     rewrite["rounded"] = [os.fspath(path) for path in rounded.directories]
     rewrite["metadata"][CALIBRATION] = json.dumps(rounded.note, sort_keys=True)
     written = _saccade.quantize(rewrite, to)
-    shutil.rmtree(kept)
+    remove(rounded, kept)
     return QuantizeReport(**_frozen(written), rounding=rounded.errors)
 
 

@@ -17,8 +17,8 @@ from saccade.cli.copying import add_copy_arguments, copy, print_report
 if TYPE_CHECKING:
     from saccade.checkpoints import Calibration
 
-#: Observations of a data set that are calibrated with. A layer is given some hundred rows by each, so that
-#: all are a few times as many as the widest layer has inputs.
+#: Observations of a data set that are calibrated with. Most layers are given some hundred rows by each, a few
+#: times as many as they have inputs by all; the last block of N1.5's head 4096, for up to 6144 inputs.
 OBSERVATIONS = 64
 
 #: The arguments that need `--calibrate`; None where they are not given.
@@ -34,12 +34,13 @@ The weights X.weight of the attention and feed-forward layers of all blocks beco
 in a byte, with a float32 scale for each output in X.weight_scale: those of the head, and those of the
 backbone unless --keep-backbone or --head-only is given. All other tensors are copied bit for bit, and so are
 the other files of the checkpoint, such as statistics, processors and tokenizers. Policy.from_pretrained(DIR,
-precision="int8") gives the same bits as loading CHECKPOINT at int8, and so with int4. The other precisions
+precision="int8") gives the same bits as loading CHECKPOINT at int8, and so with int4 unless it is calibrated.
+The other precisions
 load it too, with the dequantized weights. docs/precision.md says how much they change actions.
 
 --calibrate rounds int4 weights so that the outputs of their layers change least on observations of yours
-(GPTQ). The whole checkpoint is run in float32 on all of them, once for every gigabyte of matrices that this
-needs: minutes for a small policy, hours for a published one. It goes on where it was interrupted.
+(GPTQ). The whole checkpoint is run in float32 on all of them, once for every GiB of matrices that this needs:
+9 times for N1.5. It goes on with the layers that are missing in DIR.calibrating if it was interrupted.
 
 examples:
   saccade quantize GR00T-N1.5-3B/ --out GR00T-N1.5-3B-int8
@@ -82,6 +83,7 @@ def run(args: argparse.Namespace) -> int:
     """Writes the copy and reports what it contains."""
     from saccade.checkpoints import quantize
 
+    num_observations = 0
     chosen = {"to": args.to, "head_only": args.head_only, "keep_backbone": args.keep_backbone}
     if args.calibrate is None:
         given = [name for name in CALIBRATING if getattr(args, name) is not None]
@@ -90,15 +92,18 @@ def run(args: argparse.Namespace) -> int:
             raise UsageError(f"{flags}: only with --calibrate")
         report = copy(quantize, "quantizing", args, **chosen)
     else:
+        if args.config is not None:
+            raise UsageError("--config: not with --calibrate, which runs the checkpoint with its own")
         if args.to != "int4":
             raise UsageError(f"--calibrate: only with --to int4, given {args.to}")
         with output.progress_bar("calibrating") as update:
+            given_for = calibration(args, update)
+            num_observations = len(given_for.observations)
             report = quantize(
                 args.checkpoint,
                 args.out,
-                config=args.config,
                 force=args.force,
-                calibration=calibration(args, update),
+                calibration=given_for,
                 progress=lambda done, total: update(done // 10**6, total // 10**6, "writing, MB"),
                 **chosen,
             )
@@ -115,8 +120,8 @@ def run(args: argparse.Namespace) -> int:
     if report.rounding is not None:
         before, after = (error(report.rounding, kind) for kind in ("plain", "rounded"))
         lines.append(
-            f"{report.num_calibrated} weights were rounded for the observations; outputs of their layers "
-            f"differ by {after:.2%} in the median, and by {before:.2%} with plain rounding"
+            f"{report.num_calibrated} weights were rounded for {num_observations} observations; on these the "
+            f"outputs of their layers differ by {after:.2%} in the median, {before:.2%} with plain rounding"
         )
     return print_report(args, report, lines)
 
@@ -141,6 +146,8 @@ def calibration(args: argparse.Namespace, progress: output.Update) -> Calibratio
         raise UsageError(f"--{given[0]}: not with --calibrate {args.calibrate}, which is {kind}")
     if not is_dataset:
         require("quantize --calibrate")
+        if args.instruction is None:
+            raise UsageError("--instruction: expected what the robot is told, since --calibrate has images")
     policy = Policy.from_pretrained(args.checkpoint, **arguments.loading_options(args))
     observations: Sequence[Any]
     if is_dataset:
@@ -150,8 +157,12 @@ def calibration(args: argparse.Namespace, progress: output.Update) -> Calibratio
         data = fitted(policy, open_recordings(args.calibrate))
         observations = SpacedObservations(policy, data, args.observations or OBSERVATIONS)
     else:
-        from saccade.observations.pictures import read_frames
+        from saccade.observations.pictures import STATE, observation_folders, read_frames
 
         found = read_frames(Path(args.calibrate), policy, instruction=args.instruction, state=args.state)
+        folders = observation_folders(Path(args.calibrate), policy)
+        lacking = [folder for folder in folders if not (folder / STATE).is_file()]
+        if args.state is None and lacking:
+            raise UsageError(f"--state: expected the robot's state, since {lacking[0]} has no {STATE}")
         observations = [one.observation for one in found]
     return Calibration(policy, observations, seed=args.seed or 0, progress=progress)
