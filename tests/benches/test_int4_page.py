@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 from typing import Any
 
+from benches.int4 import __main__ as main
 from benches.int4 import page
 
 RUNS = {
@@ -43,3 +45,7 @@ def test_the_page() -> None:
 
 def test_sizes_are_left_out_where_they_were_not_measured() -> None:
     assert "Memory and loading" not in page.document(record() | {"size": None})
+
+
+def test_the_committed_page_is_that_of_its_record() -> None:
+    assert main.PAGE.read_text() == page.document(json.loads(main.KEPT.read_text()))
