@@ -212,7 +212,13 @@ def test_large_checkpoints_are_cut_into_files(source: Path, tmp_path: Path) -> N
         "metadata": {},
         "progress": None,
     }
-    rewrite |= {"head_only": False, "keep_backbone": False, "force": False, "max_shard_bytes": 100_000}
+    rewrite |= {
+        "head_only": False,
+        "keep_backbone": False,
+        "rounded": [],
+        "force": False,
+        "max_shard_bytes": 100_000,
+    }
     report = _saccade.quantize(rewrite, "int8")
     files = sorted(out.glob("*.safetensors"))
     assert len(files) > 2
