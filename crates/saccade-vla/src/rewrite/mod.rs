@@ -5,6 +5,7 @@ mod convert;
 mod float;
 mod json_edit;
 mod quantize;
+mod quantized;
 mod resize;
 mod rounding;
 

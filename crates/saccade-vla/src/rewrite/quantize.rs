@@ -3,9 +3,8 @@
 use std::collections::BTreeSet;
 use std::path::Path;
 
-use saccade_vla_checkpoint::spec::{SCALE_SUFFIX, is_quantized};
 use saccade_vla_checkpoint::{Checkpoint, CheckpointWriter, Dtype, PlannedTensor, TensorSpec};
-use saccade_vla_kernels::{quantize_rows, quantize_rows_int4};
+use saccade_vla_kernels::quantize_rows;
 
 use crate::alloc::filled;
 use crate::backbone::BackboneCheckpoint;
@@ -15,6 +14,9 @@ use crate::nn::source::weight_view;
 use crate::ops::check_interrupted;
 use crate::precision::Precision;
 use crate::rewrite::float::Float;
+use crate::rewrite::quantized::{
+    check_not_quantized, plain_int4, planned_int4, planned_with_scales, write_with_scales,
+};
 use crate::rewrite::rounding::RoundedWeights;
 use crate::rewrite::{RewriteOptions, SourceCheckpoint, Written};
 
@@ -96,25 +98,20 @@ pub fn quantize(
         ..QuantizeReport::default()
     };
     for name in source.names(options) {
-        let mut tensors = vec![source.as_it_is(name)?];
         let is_backbone = backbone_prefix.is_some_and(|prefix| name.starts_with(prefix));
-        if weights.quantized.contains(name) {
+        let tensors = if weights.quantized.contains(name) {
             report.num_quantized += 1;
             report.num_quantized_backbone += usize::from(is_backbone);
-            if to == Precision::Int4 {
-                tensors[0].dtype = Dtype::U8;
-                tensors[0].shape[1] = tensors[0].shape[1].div_ceil(2);
-            } else {
-                tensors[0].dtype = Dtype::I8;
+            let [out_features, in_features] = sizes_of(&source, name);
+            match to {
+                Precision::Int4 => planned_int4(name, out_features, in_features),
+                _ => planned_with_scales(name, Dtype::I8, [out_features, in_features]),
             }
-            tensors.push(PlannedTensor {
-                name: format!("{name}{SCALE_SUFFIX}"),
-                dtype: Dtype::F32,
-                shape: vec![source.shape(name)[0]],
-            });
+            .to_vec()
         } else {
             report.num_copied += 1;
-        }
+            vec![source.as_it_is(name)?]
+        };
         let before = source.checkpoint.nbytes(name)?;
         let after = tensors.iter().map(PlannedTensor::nbytes).sum::<usize>() as u64;
         if source.is_head(name) {
@@ -186,10 +183,9 @@ impl Quantizing {
             weights.backbone_prefix = Some(backbone.prefix());
         }
         for name in &weights.quantized {
-            if let Ok(dtype) = source.checkpoint.dtype(name)
-                && is_quantized(dtype)
-            {
-                bail!(Checkpoint, "source"; "it is quantised already: {name} is {dtype:?}, expected F32, BF16 or F16");
+            // What the source has none of is found where the tensors are listed.
+            if source.checkpoint.dtype(name).is_ok() {
+                check_not_quantized(&source.checkpoint, name)?;
             }
         }
         Ok(Self {
@@ -249,35 +245,39 @@ fn write_quantized(
     rounded: &RoundedWeights,
     writer: &mut CheckpointWriter,
 ) -> Result<()> {
-    let [out_features, in_features] = *source.shape(name) else {
-        unreachable!("a linear layer's weight has two axes")
-    };
+    let [out_features, in_features] = sizes_of(source, name);
     check_interrupted()?;
     let (bytes, scales) = match rounded.read(name, &[out_features, in_features.div_ceil(2)])? {
         Some(found) => found,
         None => {
             let weight = source.checkpoint.read(name)?;
-            let weight = weight_view(&weight, out_features, in_features);
-            let mut scales = filled("source", out_features, 0.0)?;
-            let bytes = if to == Precision::Int4 {
-                let mut values = filled("source", out_features * in_features.div_ceil(2), 0_u8)?;
-                quantize_rows_int4(weight, &mut values, &mut scales);
-                values
+            if to == Precision::Int4 {
+                plain_int4(&weight, out_features, in_features)?
             } else {
+                let mut scales = filled("source", out_features, 0.0)?;
                 let mut values = filled("source", out_features * in_features, 0_i8)?;
-                quantize_rows(weight, &mut values, &mut scales);
-                bytemuck::cast_vec(values)
-            };
-            (bytes, scales)
+                quantize_rows(
+                    weight_view(&weight, out_features, in_features),
+                    &mut values,
+                    &mut scales,
+                );
+                (bytemuck::cast_vec(values), scales)
+            }
         }
     };
     let most = if to == Precision::Int4 { 7.0 } else { 127.0 };
     if let Some(row) = scales.iter().position(|scale| !(most * scale).is_finite()) {
         bail!(Checkpoint, "source"; "{name} holds NaN or infinity in row {row}, expected finite weights");
     }
-    writer.tensor(name, &bytes)?;
-    let scales: Vec<u8> = scales.into_iter().flat_map(f32::to_le_bytes).collect();
-    Ok(writer.tensor(&format!("{name}{SCALE_SUFFIX}"), &scales)?)
+    write_with_scales(name, &bytes, &scales, writer)
+}
+
+/// Outputs and inputs of a weight that is quantised.
+fn sizes_of(source: &SourceCheckpoint, name: &str) -> [usize; 2] {
+    let Ok(sizes) = <[usize; 2]>::try_from(source.shape(name)) else {
+        unreachable!("a linear layer's weight has two axes")
+    };
+    sizes
 }
 
 /// Copies a tensor of the head bit for bit, if all its numbers are finite.

@@ -4,18 +4,17 @@
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-use saccade_vla_checkpoint::spec::{SCALE_SUFFIX, is_quantized};
-use saccade_vla_checkpoint::{Checkpoint, CheckpointWriter, Companions, Dtype, Elements, PlannedTensor};
-use saccade_vla_kernels::quantize_rows_int4;
+use saccade_vla_checkpoint::spec::SCALE_SUFFIX;
+use saccade_vla_checkpoint::{Checkpoint, CheckpointWriter, Companions, Elements};
 
 use super::factor::WHAT;
 use super::gptq::{RoundingErrors, gptq};
-use crate::alloc::{filled, product, reserved};
+use crate::alloc::{product, reserved};
 use crate::array::Array;
 use crate::error::{Error, Result, bail, ensure, show_shape};
 use crate::gram::Gram;
-use crate::nn::source::weight_view;
 use crate::ops::check_interrupted;
+use crate::rewrite::quantized::{check_not_quantized, plain_int4, planned_int4, write_with_scales};
 
 /// What the metadata of a layer's file say of its errors.
 const ERRORS: &str = "rounding_errors";
@@ -35,32 +34,26 @@ pub fn round_layer(
     threads: usize,
 ) -> Result<RoundingErrors> {
     let in_features = gram.width();
-    let num_bytes = in_features.div_ceil(2);
-    let mut rows = 0;
+    let mut outputs = Vec::with_capacity(names.len());
     for name in names {
-        let dtype = checkpoint.dtype(name)?;
-        if is_quantized(dtype) {
-            bail!(Checkpoint, "source"; "it is quantised already: {name} is {dtype:?}, expected F32, BF16 or F16");
-        }
+        check_not_quantized(checkpoint, name)?;
         match checkpoint.shape(name) {
-            Some(&[out_features, width]) if width == in_features => rows += out_features,
+            Some(&[out_features, width]) if width == in_features => outputs.push(out_features),
             shape => bail!(
                 Shape, name; expected "(out_features, {in_features})"; got "{}", show_shape(shape.unwrap_or_default())
             ),
         }
     }
+    let rows = outputs.iter().sum();
     let mut weights = reserved(WHAT, product(WHAT, &[rows, in_features])?)?;
-    let mut scales = filled(WHAT, rows, 0.0)?;
-    let mut first = 0;
-    for name in names {
+    let mut scales = reserved(WHAT, rows)?;
+    for (name, &out_features) in names.iter().zip(&outputs) {
         check_interrupted()?;
         let weight = checkpoint.read(name)?;
-        let out_features = checkpoint.shape(name).map_or(0, |shape| shape[0]);
-        let mut plain = filled(WHAT, product(WHAT, &[out_features, num_bytes])?, 0_u8)?;
-        let view = weight_view(&weight, out_features, in_features);
-        quantize_rows_int4(view, &mut plain, &mut scales[first..first + out_features]);
+        // Of plain rounding the scales are kept.
+        let (_, own) = plain_int4(&weight, out_features, in_features)?;
+        scales.extend(own);
         weights.extend(weight.into_f32()?);
-        first += out_features;
     }
     let rounded = gptq(
         Array::new(&weights, &[rows, in_features])?,
@@ -70,36 +63,21 @@ pub fn round_layer(
     )?;
     drop(weights);
 
-    let planned = names.iter().flat_map(|name| {
-        let out_features = checkpoint.shape(name).map_or(0, |shape| shape[0]);
-        [
-            PlannedTensor {
-                name: name.clone(),
-                dtype: Dtype::U8,
-                shape: vec![out_features, num_bytes],
-            },
-            PlannedTensor {
-                name: format!("{name}{SCALE_SUFFIX}"),
-                dtype: Dtype::F32,
-                shape: vec![out_features],
-            },
-        ]
-    });
+    let planned = names.iter().zip(&outputs);
+    let planned = planned.flat_map(|(name, &out_features)| planned_int4(name, out_features, in_features));
     let RoundingErrors {
         plain,
         rounded: kept,
-        outputs,
+        outputs: squares,
     } = rounded.errors;
-    let metadata = [(ERRORS.to_owned(), format!("{plain} {kept} {outputs}"))].into();
+    let metadata = [(ERRORS.to_owned(), format!("{plain} {kept} {squares}"))].into();
     let (planned, nothing) = (planned.collect(), Companions::default());
     let mut writer = CheckpointWriter::create(out, planned, &metadata, &nothing, u64::MAX, false)?;
     let (mut values, mut scales) = (rounded.values.as_slice(), scales.as_slice());
-    for name in names {
-        let out_features = checkpoint.shape(name).map_or(0, |shape| shape[0]);
+    for (name, &out_features) in names.iter().zip(&outputs) {
         let (own, others) = values.split_at(out_features * in_features);
         let (own_scales, other_scales) = scales.split_at(out_features);
-        writer.tensor(name, &packed(own, in_features))?;
-        writer.tensor(&format!("{name}{SCALE_SUFFIX}"), bytemuck::cast_slice(own_scales))?;
+        write_with_scales(name, &packed(own, in_features), own_scales, &mut writer)?;
         (values, scales) = (others, other_scales);
     }
     writer.finish()?;
