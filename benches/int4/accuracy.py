@@ -8,12 +8,13 @@ import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
 import saccade
+from benches.backbone.accuracy import checkpoint as wide_checkpoint
 from benches.checkpoints import written
 from saccade import Policy
 from saccade.checkpoints import Calibration, quantize
@@ -21,13 +22,13 @@ from saccade.datasets import open as open_recordings
 from saccade.evaluation.recordings import SpacedObservations, fitted
 from saccade.policy.reading import read_observations
 from saccade_lab import random_checkpoint
-from saccade_lab.published import CONFIGS, RELEASED
 
 #: Observations that weights are rounded for, others that errors are measured on, and chunks of each of these.
 CALIBRATED, MEASURED, SAMPLES = 24, 12, 4
 #: Episodes of each of its tasks that the bundled policy is recorded in.
 EPISODES = 4
 
+Floats: TypeAlias = npt.NDArray[np.float64]
 Note = Callable[[str], None]
 Observations = Sequence[Any]
 
@@ -72,7 +73,8 @@ def models(work: Path, *, small: bool) -> list[Model]:
         for version in ("n1.5", "n1.6", "n1.7")
     }
     if not small:
-        folders["n1.5, published width, 4 + 4 + 4 layers"] = _wide(work)
+        name = "n1.5, backbone of published width, 4 + 4 layers"
+        folders[name] = wide_checkpoint(work, outliers=True, layers=(4, 4), small=False)
     for name, folder in folders.items():
         policy = Policy.from_pretrained(folder)
         examples = [policy.example_observation(seed=seed) for seed in range(CALIBRATED + MEASURED)]
@@ -101,40 +103,21 @@ def _bundled(work: Path) -> Model:
     )
 
 
-def _wide(work: Path) -> Path:
-    """Layers of N1.5's published width, but few of them and few words."""
-    backbone, head = random_checkpoint.small_backbone("n1.5"), random_checkpoint.small_head("n1.5")
-    released, full = RELEASED["n1.5"], CONFIGS["n1.5"]
-    vocabulary = backbone["text_config"]["vocab_size"]
-    backbone["text_config"] = {**released["text_config"], "vocab_size": vocabulary}
-    backbone["vision_config"] = {**released["vision_config"], "num_hidden_layers": 4}
-    backbone["select_layer"] = 4
-    head["backbone_embedding_dim"] = full["backbone_embedding_dim"]
-    head["vl_self_attention_cfg"] = {**full["vl_self_attention_cfg"], "num_layers": 1}
-    head["diffusion_model_cfg"] = {**full["diffusion_model_cfg"], "num_layers": 4}
-    for key in ("hidden_size", "input_embedding_dim"):
-        head[key] = full[key]
-    return written(work / "outliers-wide", backbone=backbone, head=head, outliers=True)
-
-
-def actions_of(policy: Policy, observations: Observations) -> npt.NDArray[np.float64]:
-    """Normalised actions of all observations, each from the same noise in every call."""
-    found = []
+def results_of(policy: Policy, observations: Observations) -> tuple[Floats, Floats]:
+    """Normalised actions of all observations, each from the same noise in every call, and their features."""
+    actions, features = [], []
     for index, observation in enumerate(observations):
         state = read_observations(observation, policy.requirements).state
-        chunks = policy.sample(policy.encode(observation), state, seed=index, num_samples=SAMPLES)
+        context = policy.encode(observation)
+        chunks = policy.sample(context, state, seed=index, num_samples=SAMPLES)
         normalised = np.asarray(policy.normalizer.normalize_actions(chunks, state), np.float64)
-        found.append(normalised[..., : policy.normalizer.head_action_width])
-    return np.stack(found)
+        actions.append(normalised[..., : policy.normalizer.head_action_width])
+        tokens = np.asarray(context.features[0].backbone_features, np.float64)
+        features.append(tokens.reshape(-1, tokens.shape[-1]))
+    return np.stack(actions), np.concatenate(features)
 
 
-def features_of(policy: Policy, observations: Observations) -> npt.NDArray[np.float64]:
-    """Features of the backbone, all tokens of all observations."""
-    features = [policy.encode(observation).features[0].backbone_features for observation in observations]
-    return np.concatenate([np.asarray(one, np.float64).reshape(-1, one.shape[-1]) for one in features])
-
-
-def error(found: npt.NDArray[np.float64], exact: npt.NDArray[np.float64]) -> float:
+def error(found: Floats, exact: Floats) -> float:
     """Root of the sum of squared differences, relative to that of the squares."""
     return float(np.linalg.norm(found - exact) / np.linalg.norm(exact))
 
@@ -153,18 +136,14 @@ def copies(model: Model, work: Path) -> dict[str, Path]:
 
 def measure(model: Model, folders: dict[str, Path], note: Note) -> dict[str, Any]:
     """The errors of actions and features by precision, and of float32 from other noise."""
-    exact = model.policy()
-    actions, features = actions_of(exact, model.measured), features_of(exact, model.measured)
+    actions, features = results_of(model.policy(), model.measured)
     other = np.roll(actions, 1, axis=2)  # of the same observation, another sample
     assert not np.array_equal(other, actions)
     found: dict[str, Any] = {"other noise": {"actions": error(other, actions), "features": 0.0}}
     runs: dict[str, tuple[Path | None, str]] = {"bfloat16": (None, "bfloat16"), "int8": (None, "int8")}
     runs |= {name: (folder, "int4") for name, folder in folders.items()}
     for name, (folder, precision) in runs.items():
-        policy = model.policy(folder, precision)
-        found[name] = {
-            "actions": error(actions_of(policy, model.measured), actions),
-            "features": error(features_of(policy, model.measured), features),
-        }
+        changed = results_of(model.policy(folder, precision), model.measured)
+        found[name] = {"actions": error(changed[0], actions), "features": error(changed[1], features)}
         note(f"{model.name}: {name} {found[name]}")
     return found

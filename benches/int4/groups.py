@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from safetensors.numpy import save_file
 
-from benches.int4.accuracy import Model, Note, actions_of, error
+from benches.int4.accuracy import Model, Note, error, results_of
 from saccade.checkpoints import read_tensors
 
 VISION = r".*(vision_model|visual)\..*"
@@ -43,7 +43,7 @@ GROUPS = {
 def measure(model: Model, folders: dict[str, Path], work: Path, note: Note) -> dict[str, dict[str, float]]:
     """The error of actions by group and way to round. Inputs of layers stay exact."""
     exact = read_tensors(model.checkpoint)
-    actions = actions_of(model.policy(), model.measured)
+    actions, _ = results_of(model.policy(), model.measured)
     found: dict[str, dict[str, float]] = {}
     for kind, folder in folders.items():
         rounded = read_tensors(folder)
@@ -56,7 +56,7 @@ def measure(model: Model, folders: dict[str, Path], work: Path, note: Note) -> d
             changed = {name: rounded[name][:, : exact[name].shape[1]] for name in of_group}
             mixed = _written(model.checkpoint, work / "mixed", exact | changed)
             errors = found.setdefault(group, {})
-            errors[kind] = error(actions_of(model.policy(mixed), model.measured), actions)
+            errors[kind] = error(results_of(model.policy(mixed), model.measured)[0], actions)
             note(f"{model.name}: {group}, {len(of_group)} weights, {kind} {errors[kind]:.2e}")
     shutil.rmtree(work / "mixed", ignore_errors=True)
     return found
