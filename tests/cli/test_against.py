@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import gc
 import json
 import shutil
-import weakref
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +15,6 @@ from saccade import InputError, Policy
 from saccade._internal.environment import arithmetic
 from saccade.evaluation.episode_files import EpisodeFiles
 from saccade.evaluation.pairing import SHARED, check_said, check_shared, interface_of
-from saccade.evaluation.source import forget_policy
 from tests.helpers.recorded_cases import Recorded, demo_policy
 from tests.helpers.recorded_commands import DEMO, results, run
 
@@ -330,20 +327,6 @@ def test_the_shape_of_the_noise_is_that_of_the_head() -> None:
     assert json.loads(json.dumps(found)) == found  # so that the settings of a file compare
 
 
-def test_one_policy_is_in_memory(
-    folder: Path, other: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    load, most = Policy.from_pretrained, []
-    loaded: list[weakref.ref[Policy]] = []
-
-    def counted(*arguments: Any, **options: Any) -> Policy:
-        gc.collect()
-        most.append(sum(one() is not None for one in loaded))
-        policy = load(*arguments, **options)
-        loaded.append(weakref.ref(policy))
-        return policy
-
-    forget_policy()
-    monkeypatch.setattr(Policy, "from_pretrained", counted)
+def test_one_policy_is_in_memory(folder: Path, other: Path, tmp_path: Path, held_at_loads: list[int]) -> None:
     assert run("evaluate", DEMO, folder, "--out", tmp_path / "out", *OPTIONS, "--against", other) == 0
-    assert most == [0, 0, 0]  # this one for its checks, the other one, this one
+    assert held_at_loads == [0, 0, 0]  # this one for its checks, the other one, this one

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from saccade._internal import flags as arguments
 from saccade._internal.files import write_json
-from saccade._internal.flags import UsageError
+from saccade._internal.flags import UsageError, flags_given
 from saccade.cli import EXIT_OK, output
 from saccade_lab import flags as lab_flags
 from saccade_lab.extras import LAB, require
@@ -207,10 +207,8 @@ def check(args: argparse.Namespace) -> None:
         from saccade_lab.sim.tasks import check_evaluation_seeds
 
         check_evaluation_seeds(args.seed, 1)
-        wrong = [name for name in (*of_file, "row") if getattr(args, name) is not None]
-        if wrong:
-            flags = ", ".join("--" + name.replace("_", "-") for name in wrong)
-            raise UsageError(f"{flags}: only with --features{' or --frames' * (wrong == ['row'])}")
+        if given := flags_given(args, (*of_file, "row")):
+            raise UsageError(f"{given}: only with --features{' or --frames' * (given == '--row')}")
 
 
 def probabilities(config: HeadConfig, view: View, blocks: int, steps: int) -> int:

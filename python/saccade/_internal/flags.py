@@ -313,6 +313,13 @@ def json_object(word: str) -> dict[str, Any]:
     return found
 
 
+#: The arguments that say how a policy is loaded, but for the precision.
+LOADING = (
+    *("embodiment", "preprocessing", "tokenizer", "data_config", "action_horizon", "processor_options"),
+    "num_threads",
+)
+
+
 def policy_options(args: argparse.Namespace) -> dict[str, Any]:
     """Keyword arguments of `saccade.Policy.from_pretrained`, from the flags declared above."""
     precision = {"backbone": args.precision, "head": args.head_precision or args.precision}
@@ -321,5 +328,15 @@ def policy_options(args: argparse.Namespace) -> dict[str, Any]:
 
 def loading_options(args: argparse.Namespace) -> dict[str, Any]:
     """Those of `policy_options` that do not depend on the precision."""
-    names = ("embodiment", "preprocessing", "tokenizer", "data_config", "action_horizon", "processor_options")
-    return {name: getattr(args, name) for name in (*names, "num_threads")}
+    return {name: getattr(args, name) for name in LOADING}
+
+
+def flags_given(args: argparse.Namespace, names: Iterable[str]) -> str:
+    """The flags of those arguments that are given, for messages; empty if none is.
+
+    Example:
+        >>> args = argparse.Namespace(seed=0, num_threads=2, state=None)
+        >>> flags_given(args, ["num_threads", "seed", "state"])
+        '--num-threads, --seed'
+    """
+    return ", ".join("--" + name.replace("_", "-") for name in names if getattr(args, name) is not None)

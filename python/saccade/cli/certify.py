@@ -71,8 +71,10 @@ def _files(args: argparse.Namespace, certificate: Certificate) -> dict[str, Any]
     Raises:
         FileNotFoundError: The certificate's is not.
     """
+    from saccade.evaluation.source import OPTION_FILES
+
     found = {}
-    for name in ("tokenizer", "data_config"):
+    for name in OPTION_FILES:
         certified = certificate.options.get(name)
         found[name] = getattr(args, name) or certified
         is_here = (

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from saccade._internal import flags as arguments
-from saccade._internal.flags import UsageError, add_data_config, add_overrides
+from saccade._internal.flags import UsageError, add_data_config, add_overrides, flags_given
 from saccade.cli import EXIT_OK, output, precisions
 from saccade.cli.output import Section, show
 
@@ -63,10 +63,8 @@ def run(args: argparse.Namespace) -> int:
     """Reads the checkpoint and prints what it contains, or compares its precisions."""
     if args.precision_check is not None:
         return precisions.run(args)
-    given = [name for name in precisions.ARGUMENTS if getattr(args, name) is not None]
-    if given:
-        flags = ", ".join("--" + name.replace("_", "-") for name in given)
-        raise UsageError(f"{flags}: only with --precision-check")
+    if given := flags_given(args, precisions.ARGUMENTS):
+        raise UsageError(f"{given}: only with --precision-check")
     from saccade.checkpoints.inspection import inspect
 
     with output.progress_bar("reading", in_bytes=True, transient=True) as update:

@@ -22,10 +22,7 @@ if TYPE_CHECKING:
 OBSERVATIONS = 64
 
 #: The arguments that need `--calibrate`; None where they are not given.
-CALIBRATING = (
-    *("observations", "instruction", "state", "embodiment", "preprocessing", "tokenizer", "data_config"),
-    *("action_horizon", "processor_options", "seed", "num_threads"),
-)
+CALIBRATING = ("observations", "instruction", "state", "seed", *arguments.LOADING)
 
 HELP = "write a checkpoint with int8 or int4 weights"
 
@@ -35,8 +32,8 @@ in a byte, with a float32 scale for each output in X.weight_scale: those of the 
 backbone unless --keep-backbone or --head-only is given. All other tensors are copied bit for bit, and so are
 the other files of the checkpoint, such as statistics, processors and tokenizers. Policy.from_pretrained(DIR,
 precision="int8") gives the same bits as loading CHECKPOINT at int8, and so with int4 unless it is calibrated.
-The other precisions
-load it too, with the dequantized weights. docs/precision.md says how much they change actions.
+The other precisions load it too, with the dequantized weights. docs/precision.md says how much they change
+actions.
 
 --calibrate rounds int4 weights so that the outputs of their layers change least on observations of yours
 (GPTQ). The whole checkpoint is run in float32 on all of them, once for every GiB of matrices that this needs:
@@ -83,13 +80,11 @@ def run(args: argparse.Namespace) -> int:
     """Writes the copy and reports what it contains."""
     from saccade.checkpoints import quantize
 
-    num_observations = 0
+    observations: Sequence[Any] = ()
     chosen = {"to": args.to, "head_only": args.head_only, "keep_backbone": args.keep_backbone}
     if args.calibrate is None:
-        given = [name for name in CALIBRATING if getattr(args, name) is not None]
-        if given:
-            flags = ", ".join("--" + name.replace("_", "-") for name in given)
-            raise UsageError(f"{flags}: only with --calibrate")
+        if given := arguments.flags_given(args, CALIBRATING):
+            raise UsageError(f"{given}: only with --calibrate")
         report = copy(quantize, "quantizing", args, **chosen)
     else:
         if args.config is not None:
@@ -97,13 +92,13 @@ def run(args: argparse.Namespace) -> int:
         if args.to != "int4":
             raise UsageError(f"--calibrate: only with --to int4, given {args.to}")
         with output.progress_bar("calibrating") as update:
-            given_for = calibration(args, update)
-            num_observations = len(given_for.observations)
+            seen = calibration(args, update)
+            observations = seen.observations
             report = quantize(
                 args.checkpoint,
                 args.out,
                 force=args.force,
-                calibration=given_for,
+                calibration=seen,
                 progress=lambda done, total: update(done // 10**6, total // 10**6, "writing, MB"),
                 **chosen,
             )
@@ -120,8 +115,9 @@ def run(args: argparse.Namespace) -> int:
     if report.rounding is not None:
         before, after = (error(report.rounding, kind) for kind in ("plain", "rounded"))
         lines.append(
-            f"{report.num_calibrated} weights were rounded for {num_observations} observations; on these the "
-            f"outputs of their layers differ by {after:.2%} in the median, {before:.2%} with plain rounding"
+            f"{report.num_calibrated} weights were rounded for {len(observations)} observations; on these "
+            f"the outputs of their layers differ by {after:.2%} in the median, {before:.2%} with plain "
+            "rounding"
         )
     return print_report(args, report, lines)
 
@@ -140,10 +136,9 @@ def calibration(args: argparse.Namespace, progress: output.Update) -> Calibratio
 
     is_dataset = hub.parse(args.calibrate) is not None or (Path(args.calibrate) / "meta").is_dir()
     wrong = ("instruction", "state") if is_dataset else ("observations",)
-    given = [name for name in wrong if getattr(args, name) is not None]
-    if given:
+    if given := arguments.flags_given(args, wrong):
         kind = "a data set" if is_dataset else "a directory of images"
-        raise UsageError(f"--{given[0]}: not with --calibrate {args.calibrate}, which is {kind}")
+        raise UsageError(f"{given}: not with --calibrate {args.calibrate}, which is {kind}")
     if not is_dataset:
         require("quantize --calibrate")
         if args.instruction is None:
@@ -160,9 +155,9 @@ def calibration(args: argparse.Namespace, progress: output.Update) -> Calibratio
         from saccade.observations.pictures import STATE, observation_folders, read_frames
 
         found = read_frames(Path(args.calibrate), policy, instruction=args.instruction, state=args.state)
-        folders = observation_folders(Path(args.calibrate), policy)
+        folders = [] if args.state is not None else observation_folders(Path(args.calibrate), policy)
         lacking = [folder for folder in folders if not (folder / STATE).is_file()]
-        if args.state is None and lacking:
+        if lacking:
             raise UsageError(f"--state: expected the robot's state, since {lacking[0]} has no {STATE}")
         observations = [one.observation for one in found]
     return Calibration(policy, observations, seed=args.seed or 0, progress=progress)

@@ -18,7 +18,7 @@ from saccade._internal.environment import arithmetic, cpu_name
 from saccade.errors import InputError
 from saccade.evaluation.prediction import noise_of
 from saccade.evaluation.recordings import Recordings, length_of, observation_at
-from saccade.evaluation.source import Source, forget_policy, named
+from saccade.evaluation.source import OPTION_FILES, Source, forget_policy, named
 from saccade.policy.policy import Policy
 from saccade.robots import Normalizer
 
@@ -30,8 +30,6 @@ OPTIONS = (
     "precision",
 )
 SAMPLING = ("num_steps", "integrator", "future_refresh")
-#: Options whose files may be read besides the checkpoint.
-OPTION_FILES = ("tokenizer", "data_config")
 TOLERANCE = 1e-3  # of normalised actions elsewhere, or twice the precision's own difference
 #: Where these are equal, the actions must have the same bits. Dot products matter to other precisions.
 EXACT, ROUNDED = ("saccade", "library", "instruction_set"), ("dot_products",)

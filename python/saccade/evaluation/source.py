@@ -22,6 +22,9 @@ from saccade.errors import InputError
 from saccade.policy.policy import Policy
 from saccade.robots.data_configs import RELEASED
 
+#: Options whose files may be read besides the checkpoint.
+OPTION_FILES = ("tokenizer", "data_config")
+
 
 @dataclass(frozen=True)
 class Source:
@@ -126,7 +129,7 @@ class Source:
         """
         files = {
             name: _absolute(given)
-            for name in ("tokenizer", "data_config")
+            for name in OPTION_FILES
             if isinstance(given := self.options.get(name), str)
             and not (name == "data_config" and given in RELEASED)
         }
