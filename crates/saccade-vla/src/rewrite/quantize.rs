@@ -46,7 +46,7 @@ pub struct QuantizeReport {
 }
 
 /// Writes the checkpoint `source` to the directory `out` with the weights of the blocks' linear layers in the precision `to`: int8 as I8
-/// `X.weight (out, in)` by [`quantize_rows`], or int4 as U8 `X.weight (out, in / 2)`, rounded up, by [`quantize_rows_int4`]; and float32
+/// `X.weight (out, in)` by [`quantize_rows`], or int4 as U8 `X.weight (out, in / 2)`, rounded up, by [`quantize_rows_int4`](saccade_vla_kernels::quantize_rows_int4); and float32
 /// `X.weight_scale (out)`. That is what [`Precision::Int8`] and [`Precision::Int4`] compute with, so that loading the result at that precision
 /// gives the same bits as loading `source` at it. So are the blocks of a backbone, if there is one that [`Backbone`](crate::Backbone) loads.
 /// All other tensors are copied bit for bit.
