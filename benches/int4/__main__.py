@@ -1,20 +1,27 @@
-"""What int4 costs and saves: errors of actions, sensitive layers, memory and loading.
+"""What int4 costs and saves.
 
-    python -m benches.int4 [--work DIR] [--small]           measures, into out/int4.json
-    python -m benches.int4 --full CHECKPOINT                also memory and loading of this N1.5
+    python -m benches.int4 errors [--small] [--policy DIR]  of actions, by precision and by group of layers
+    python -m benches.int4 loop [--policy DIR]              success in closed loop on the same episodes
+    python -m benches.int4 full [CHECKPOINT]                memory, loading and time at N1.5's published size
+    python -m benches.int4 calibrate [CHECKPOINT]           how long its calibration takes
     python -m benches.int4 report [--write]                 prints the page, or writes docs/results/int4.md
 
-Needs the lab with its simulator: the bundled policy is recorded in its tasks first. About half an hour.
+Each adds to out/int4.json what it measured; the report has the committed measurements for the rest. Needs the
+lab with its simulator: trained policies are recorded in their tasks first. A policy is one that `saccade
+train` wrote; the bundled one is measured without being named. Without a CHECKPOINT a random one is written.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import sys
 from pathlib import Path
 from typing import Any
 
-from benches.int4 import accuracy, groups, size
+import saccade
+from benches.checkpoints import n15
+from benches.int4 import accuracy, closed_loop, groups, size, time
 from benches.int4.page import document
 from benches.pages.report import report
 from benches.peers.machine import describe
@@ -25,42 +32,82 @@ MEASURED = ROOT / "out" / "int4.json"
 KEPT = Path(__file__).with_name("results.json")
 PAGE = ROOT / "docs" / "results" / "int4.md"
 
-#: The models whose groups of layers are measured one by one.
-BY_GROUP = 2
+#: The random models whose groups of layers are measured one by one, beside the trained ones.
+BY_GROUP = 1
 
 
-def measure(args: argparse.Namespace) -> dict[str, Any]:
-    """All measurements."""
+def note(line: str) -> None:
+    """Says what was measured."""
+    print(line, file=sys.stderr, flush=True)
 
-    def note(line: str) -> None:
-        print(line, file=sys.stderr, flush=True)
 
-    found: dict[str, Any] = {"machine": describe(), "accuracy": {}, "groups": {}, "size": None}
-    args.work.mkdir(parents=True, exist_ok=True)
-    for index, model in enumerate(accuracy.models(args.work, small=args.small)):
+def policies(args: argparse.Namespace) -> list[accuracy.Trained]:
+    """The bundled policy, and those that are named."""
+    return [accuracy.trained(folder, args.work) for folder in (saccade.demo_checkpoint(), *args.policy)]
+
+
+def errors(args: argparse.Namespace) -> dict[str, Any]:
+    """Errors of actions."""
+    found: dict[str, Any] = {"models": {}, "groups": {}}
+    trained, others = policies(args), accuracy.random_models(args.work, small=args.small)
+    for model in (*trained, *others):
         folders = accuracy.copies(model, args.work)
-        found["accuracy"][model.name] = accuracy.measure(model, folders, note)
-        if index < BY_GROUP:
+        found["models"][model.name] = accuracy.measure(model, folders, note)
+        if model in (*trained, *others[:BY_GROUP]):
             found["groups"][model.name] = groups.measure(model, folders, args.work, note)
-    if args.full is not None:
-        found["size"] = size.measure(args.full, args.work, args.num_threads, note)
     return found
+
+
+def loop(args: argparse.Namespace) -> dict[str, Any]:
+    """Success in closed loop."""
+    return {
+        model.name: closed_loop.measure(
+            model, accuracy.copies(model, args.work), args.episodes, args.jobs, note
+        )
+        for model in policies(args)
+    }
+
+
+def full(args: argparse.Namespace) -> dict[str, Any]:
+    """Memory, loading and time at published size."""
+    checkpoint = n15(args.work, small=False, given=args.checkpoint)
+    sizes = size.measure(checkpoint, args.work, args.num_threads, note)
+    return {"size": sizes, "time": time.measure(args.work, args.num_threads, note)}
+
+
+def calibrate(args: argparse.Namespace) -> dict[str, Any]:
+    """How long calibration takes at published size."""
+    checkpoint = n15(args.work, small=False, given=args.checkpoint)
+    return size.calibrate(checkpoint, args.work, args.num_threads, note)
+
+
+MEASUREMENTS = {"errors": errors, "loop": loop, "full": full, "calibrate": calibrate}
 
 
 def main() -> int:
     """Measures, or reports."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n\n")[0])
-    parser.add_argument("what", nargs="?", choices=("measure", "report"), default="measure")
+    raw = argparse.RawDescriptionHelpFormatter
+    parser = argparse.ArgumentParser(prog="python -m benches.int4", description=__doc__, formatter_class=raw)
+    parser.add_argument("what", choices=(*MEASUREMENTS, "report"))
+    parser.add_argument("checkpoint", nargs="?", type=Path, metavar="CHECKPOINT")
     parser.add_argument("--work", type=Path, default=ROOT / "out" / "int4", help="recordings and checkpoints")
-    parser.add_argument("--small", action="store_true", help="leave out the model of published width")
-    parser.add_argument("--full", type=Path, metavar="CHECKPOINT", help="a whole N1.5 of published size")
+    parser.add_argument("--small", action="store_true", help="errors: leave out the model of published width")
+    parser.add_argument(
+        "--policy", type=Path, action="append", default=[], metavar="DIR", help="also this one"
+    )
+    parser.add_argument("--episodes", type=int, default=300, help="loop: of a policy (default: 300)")
+    parser.add_argument("--jobs", type=int, default=2, help="loop: processes (default: 2)")
     parser.add_argument("--num-threads", type=int, default=2)
     parser.add_argument("--write", action="store_true", help="report: write the page")
     args = parser.parse_args()
     if args.what == "report":
         return report(MEASURED, KEPT, PAGE, document, program="benches.int4", write=args.write)
+    args.work.mkdir(parents=True, exist_ok=True)
     MEASURED.parent.mkdir(exist_ok=True)
-    write_json(MEASURED, measure(args))
+    measured = {"machine": describe()} | {"measured": MEASUREMENTS[args.what](args)}
+    before = next((path for path in (MEASURED, KEPT) if path.exists()), None)
+    found = json.loads(before.read_text()) if before else {}
+    write_json(MEASURED, found | {args.what: measured})
     return 0
 
 

@@ -22,11 +22,12 @@ from saccade.datasets import open as open_recordings
 from saccade.evaluation.recordings import SpacedObservations, fitted
 from saccade.policy.reading import read_observations
 from saccade_lab import random_checkpoint
+from saccade_lab.sim.settings import CONFIG_FILE, SimulationConfig
 
 #: Observations that weights are rounded for, others that errors are measured on, and chunks of each of these.
 CALIBRATED, MEASURED, SAMPLES = 24, 12, 4
-#: Episodes of each of its tasks that the bundled policy is recorded in.
-EPISODES = 4
+#: Episodes that a trained policy is recorded in, an equal number of each of its tasks.
+EPISODES = 20
 
 Floats: TypeAlias = npt.NDArray[np.float64]
 Note = Callable[[str], None]
@@ -54,14 +55,24 @@ class Model:
         return Policy.from_pretrained(folder or self.checkpoint, precision=precision)
 
 
-def models(work: Path, *, small: bool) -> list[Model]:
-    """The bundled policy, trained, on its own recordings; and random ones with planted outliers.
+@dataclass(frozen=True)
+class Trained(Model):
+    """A policy of the simulator, with observations of its own episodes.
+
+    Attributes:
+        tasks: That it was trained on.
+    """
+
+    tasks: tuple[str, ...]
+
+
+def random_models(work: Path, *, small: bool) -> list[Model]:
+    """Random models with planted outliers, and random observations.
 
     Args:
-        work: Folder that keeps recordings and checkpoints.
+        work: Folder that keeps checkpoints.
         small: Leaves out the one of published width.
     """
-    found = [_bundled(work)]
     folders = {
         f"{version}, small": written(
             work / f"outliers-{version}",
@@ -72,6 +83,7 @@ def models(work: Path, *, small: bool) -> list[Model]:
         )
         for version in ("n1.5", "n1.6", "n1.7")
     }
+    found: list[Model] = []
     if not small:
         name = "n1.5, backbone of published width, 4 + 4 layers"
         folders[name] = wide_checkpoint(work, outliers=True, layers=(4, 4), small=False)
@@ -82,24 +94,33 @@ def models(work: Path, *, small: bool) -> list[Model]:
     return found
 
 
-def _bundled(work: Path) -> Model:
-    """The bundled policy in episodes of its own."""
-    recordings, checkpoint = work / "recordings", saccade.demo_checkpoint()
+def trained(checkpoint: Path, work: Path) -> Trained:
+    """A policy that `saccade train` wrote, in episodes of its own, which are recorded first.
+
+    Args:
+        checkpoint: Its directory.
+        work: Folder that keeps the recordings.
+    """
+    tasks = SimulationConfig.from_file(checkpoint / CONFIG_FILE).tasks
+    bundled = checkpoint == saccade.demo_checkpoint()
+    name = "the bundled policy" if bundled else f"a policy for {', '.join(tasks)}"
+    recordings = work / f"{checkpoint.name}-recordings"
     if not recordings.is_dir():
-        arguments = ["rollout", "--episodes", str(EPISODES), "--record", str(recordings)]
-        subprocess.run(
-            [sys.executable, "-m", "saccade", *arguments, "--out", str(work / "rollout")], check=True
-        )
+        arguments = ["rollout", "--checkpoint", str(checkpoint), "--tasks", ",".join(tasks)]
+        arguments += ["--episodes", str(EPISODES // len(tasks)), "--record", str(recordings)]
+        arguments += ["--out", str(work / f"{checkpoint.name}-rollout")]
+        subprocess.run([sys.executable, "-m", "saccade", *arguments], check=True)
     policy = Policy.from_pretrained(checkpoint)
     data = fitted(policy, open_recordings(recordings))
     both = SpacedObservations(policy, data, 2 * (CALIBRATED + MEASURED))
     held_out = [one for one, (episode, _) in zip(both, both.places, strict=True) if episode % 3 == 0]
     others = [one for one, (episode, _) in zip(both, both.places, strict=True) if episode % 3]
-    return Model(
-        "the bundled policy, its own episodes",
+    return Trained(
+        name,
         checkpoint,
         others[:: max(1, len(others) // CALIBRATED)],
         held_out[:: max(1, len(held_out) // MEASURED)],
+        tasks,
     )
 
 

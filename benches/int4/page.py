@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import statistics
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
+
+from saccade_lab.study.statistics import paired_difference, scaled, verdict
+from saccade_lab.timing import quartiles
 
 RUNS = ("bfloat16", "int8", "int4", "int4, calibrated")
 
@@ -19,32 +22,76 @@ ABOUT_GROUPS = """\
 Errors of actions if the weights of one group of layers are rounded to four bits, and all others and all
 inputs of layers are exact. The groups with the largest errors would gain most from more bits."""
 
+ABOUT_LOOP = """\
+Backbone and head at each precision, on the same episodes as float32: seeds that neither training nor
+calibration used, an equal number of each task. Differences are in percentage points, with Tango's 95 %
+intervals; "no worse" means that the interval contains zero and excludes a loss of 5 points."""
+
 ABOUT_SIZE = """\
 A whole policy of N1.5's published size with random weights and one embodiment, loaded from what
 `saccade quantize` wrote, each load in a process of its own with the page cache dropped: medians. Peak memory
 includes the interpreter and its libraries."""
 
+ABOUT_TIME = """\
+The same policies, one observation at a time, by turns in one process: medians, and the median of the ratios
+of one round with its quartiles. The first part is from images to the context of the head, the second a chunk
+from a held context."""
+
 SIZES = ("file, GB", "weights, GB", "peak at loading, GB", "peak with a call, GB", "loading, s", "reading, s")
 
 
 def document(record: Mapping[str, Any]) -> str:
-    """Markdown of a record."""
-    machine = record["machine"]
+    """Markdown of a record, which has what was measured and on what machine, by the word of the command."""
     parts = [
-        "# int4: errors, sensitive layers, memory",
+        "# int4: errors, sensitive layers, closed loop, memory",
         "Written by `python -m benches.int4 report --write` from `benches/int4/results.json`, which "
-        f"`python -m benches.int4` measured: {machine['cpu']} ({machine['family']}, "
-        f"{machine['isa']}), {machine['cores']} cores; commit {machine['commit']}.",
-        "## Errors by precision",
-        ABOUT,
-        errors(record["accuracy"]),
-        "## One group of layers at a time",
-        ABOUT_GROUPS,
-        groups(record["groups"]),
+        "`python -m benches.int4` measured, with the word that each section names.",
     ]
-    if record.get("size"):
-        parts += ["## Memory and loading", ABOUT_SIZE, size(record["size"])]
+    for word, section in SECTIONS.items():
+        if word in record:
+            parts += [*section(record[word]["measured"]), by(word, record[word]["machine"])]
     return "\n\n".join(parts) + "\n"
+
+
+def by(word: str, machine: Mapping[str, Any]) -> str:
+    """What measured, and on what machine."""
+    where = f"{machine['cpu']} ({machine['family']}, {machine['isa']}), {machine['cores']} cores"
+    return f"(`python -m benches.int4 {word}`: {where}; commit {machine['commit']}.)"
+
+
+def errors_section(measured: Mapping[str, Any]) -> list[str]:
+    """Errors by precision, and by group of layers."""
+    parts = ["## Errors by precision", ABOUT, errors(measured["models"])]
+    return [*parts, "## One group of layers at a time", ABOUT_GROUPS, groups(measured["groups"])]
+
+
+def loop_section(measured: Mapping[str, Any]) -> list[str]:
+    """Success in closed loop."""
+    return ["## Closed loop", ABOUT_LOOP, loops(measured)]
+
+
+def full_section(measured: Mapping[str, Any]) -> list[str]:
+    """Memory, loading and time at published size."""
+    parts = ["## Memory and loading", ABOUT_SIZE, size(measured["size"])]
+    return [*parts, "## Time", ABOUT_TIME, times(measured["time"])]
+
+
+def calibration_section(measured: Mapping[str, Any]) -> list[str]:
+    """How long calibration takes."""
+    words = (
+        f"`saccade quantize --calibrate` of the same policy, for {measured['observations']} observations "
+        f"({measured['weights']} weights): {measured['seconds'] / 60:.1f} minutes, and at most "
+        f"{measured['peak'] / 1e9:.1f} GB of memory."
+    )
+    return ["## Calibration", words]
+
+
+SECTIONS: dict[str, Callable[[Mapping[str, Any]], list[str]]] = {
+    "errors": errors_section,
+    "loop": loop_section,
+    "full": full_section,
+    "calibrate": calibration_section,
+}
 
 
 def errors(measured: Mapping[str, Mapping[str, Mapping[str, float]]]) -> str:
@@ -70,6 +117,36 @@ def groups(measured: Mapping[str, Mapping[str, Mapping[str, float]]]) -> str:
         ]
         tables.append("\n".join(lines))
     return "\n\n".join(tables)
+
+
+def loops(measured: Mapping[str, Any]) -> str:
+    """A row for each policy and precision."""
+    rows = ["| | success | difference, points | verdict |", "|---|---|---|---|"]
+    for policy, found in measured.items():
+        rows.append(f"| **{policy}**: {', '.join(found['tasks'])} | | | |")
+        exact = found["success"]["float32"]
+        for name, success in found["success"].items():
+            cells = [name, f"{sum(success)} of {len(success)}", "", ""]
+            if name != "float32":
+                difference = paired_difference(success, exact).difference
+                points = scaled(difference)
+                cells[2:] = [
+                    f"{points.value:.1f} ({points.low:.1f} to {points.high:.1f})",
+                    verdict(difference),
+                ]
+            rows.append(f"| {' | '.join(cells)} |")
+    return "\n".join(rows)
+
+
+def times(measured: Mapping[str, Mapping[str, Sequence[float]]]) -> str:
+    """A row for each part of a call."""
+    rows = ["| | int8, ms | int4, ms | int4 over int8 |", "|---|---|---|---|"]
+    for part, found in measured.items():
+        ratios = [four / eight for four, eight in zip(found["int4"], found["int8"], strict=True)]
+        low, middle, high = quartiles(ratios)
+        medians = [f"{1e3 * statistics.median(found[name]):.0f}" for name in ("int8", "int4")]
+        rows.append(f"| {part} | {' | '.join(medians)} | {middle:.2f} ({low:.2f} to {high:.2f}) |")
+    return "\n".join(rows)
 
 
 def size(measured: Mapping[str, Any]) -> str:

@@ -1,17 +1,22 @@
-"""Files, memory and loading of N1.5 at its published size, as `saccade quantize` writes int8 and int4."""
+"""N1.5 at its published size in int8 and int4: files, memory, loading, how long calibration takes."""
 
 from __future__ import annotations
 
+import multiprocessing
+import time
 from pathlib import Path
 from typing import Any
 
 import saccade
 from benches.backbone.memory import measure as measure_loading
+from benches.backbone.memory import peak_memory
 from benches.int4.accuracy import Note
-from saccade.checkpoints import convert, quantize
+from saccade.checkpoints import Calibration, convert, quantize
 
 #: Loads of each, by turns.
 ROUNDS = 3
+#: Observations that weights are rounded for.
+CALIBRATED = 16
 
 
 def measure(checkpoint: Path, work: Path, threads: int, note: Note) -> dict[str, Any]:
@@ -21,9 +26,7 @@ def measure(checkpoint: Path, work: Path, threads: int, note: Note) -> dict[str,
         By precision `file_bytes`, on disk, and `loads`, each in a process of its own, as
         `benches.backbone.memory.measure` returns it.
     """
-    one = work / "one-embodiment"
-    kept = saccade.Normalizer.from_pretrained(checkpoint).embodiment_id
-    convert(checkpoint, one, embodiment_ids=None if kept is None else [kept], force=True)
+    one = with_one_embodiment(checkpoint, work)
     found: dict[str, Any] = {}
     for precision in ("int8", "int4"):
         folder = work / precision
@@ -38,3 +41,38 @@ def measure(checkpoint: Path, work: Path, threads: int, note: Note) -> dict[str,
             note(f"{precision}: {loaded}")
             one_of["loads"].append(loaded)
     return found
+
+
+def with_one_embodiment(checkpoint: Path, work: Path) -> Path:
+    """A copy with the layers of the robot that the checkpoint has statistics of."""
+    one = work / "one-embodiment"
+    kept = saccade.Normalizer.from_pretrained(checkpoint).embodiment_id
+    convert(checkpoint, one, embodiment_ids=None if kept is None else [kept], force=True)
+    return one
+
+
+def calibrate(checkpoint: Path, work: Path, threads: int, note: Note) -> dict[str, Any]:
+    """Rounds all weights to four bits for random observations, in a process of its own.
+
+    Returns:
+        `observations`, `weights`: their number, and that of the rounded weights; `seconds`; `peak`: the peak
+        memory in bytes.
+    """
+    one = with_one_embodiment(checkpoint, work)
+    with multiprocessing.get_context("spawn").Pool(1) as pool:
+        found: dict[str, Any] = pool.apply(_calibrate, (one, work / "calibrated-full", threads))
+    note(f"calibration: {found}")
+    return found
+
+
+def _calibrate(checkpoint: Path, out: Path, threads: int) -> dict[str, Any]:
+    policy = saccade.Policy.from_pretrained(checkpoint, num_threads=threads)
+    observations = [policy.example_observation(seed=seed) for seed in range(CALIBRATED)]
+    start = time.perf_counter()
+    report = quantize(checkpoint, out, to="int4", calibration=Calibration(policy, observations), force=True)
+    return {
+        "observations": CALIBRATED,
+        "weights": report.num_calibrated,
+        "seconds": time.perf_counter() - start,
+        "peak": peak_memory(),
+    }
