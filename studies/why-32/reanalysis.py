@@ -17,6 +17,10 @@ from collections.abc import Callable, Sequence
 from fractions import Fraction
 from pathlib import Path
 
+import numpy as np
+import numpy.typing as npt
+
+Array = npt.NDArray[np.float64]
 Row = dict[str, str]
 Test = tuple[str, list[float]]
 
@@ -87,16 +91,18 @@ def check(rows: list[Row], trained: list[Row], episodes: list[Row]) -> None:
     expect("one settings_sha256 in all rows", len({row["settings_sha256"] for row in rows}) == 1)
 
 
-def sign_sums(values: Sequence[float]) -> list[tuple[float, int]]:
+def sign_sums(values: Sequence[float]) -> Array:
     """For each of the 2^n assignments of signs: the signed sum of the values, and the sum of the signs."""
     assignments = itertools.product((1, -1), repeat=len(values))
-    return [(math.fsum(map(operator.mul, signs, values)), sum(signs)) for signs in assignments]
+    sums = [(math.fsum(map(operator.mul, signs, values)), sum(signs)) for signs in assignments]
+    return np.array(sums).T
 
 
-def extreme(sums: list[tuple[float, int]], shift: float = 0.0) -> int:
+def extreme(sums: Array, shift: float = 0.0) -> int:
     """How many assignments give values - shift a sum at least as far from zero as the observed one."""
-    observed = abs(sums[0][0] - shift * sums[0][1])  # the first assignment is all plus
-    return sum(abs(total - shift * signs) >= observed - 1e-9 for total, signs in sums)
+    totals, signs = sums
+    distances = np.abs(totals - shift * signs)
+    return int((distances >= distances[0] - 1e-9).sum())  # the first assignment is all plus
 
 
 def interval(values: Sequence[float], level: float = 0.05) -> tuple[float, float]:
@@ -106,7 +112,7 @@ def interval(values: Sequence[float], level: float = 0.05) -> tuple[float, float
     reach = max(abs(v - mean) for v in values)
 
     def accepts(shift: float) -> bool:
-        return extreme(sums, shift) > level * len(sums)
+        return extreme(sums, shift) > level * len(sums.T)
 
     grid = [mean + reach * step / 200 for step in range(-201, 202)]
     inside = [accepts(shift) for shift in grid]
