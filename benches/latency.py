@@ -128,7 +128,7 @@ def callers(args: argparse.Namespace, before: Report) -> Report:
     del before
     whole = Case("head", args.threads, size=args.size)
     heads = {
-        "the bundled policy's size": (policy_config(), "policy", 56, 40),
+        "the bundled policy's size": (policy_config(), "policy", 56, 40 if args.size == "full" else 5),
         f"N1.5's structure ({args.size})": (inputs.config_of(whole), f"n15-{args.size}", 296, 1),
     }
     cases = {}

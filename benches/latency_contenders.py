@@ -20,6 +20,7 @@ from benches.peers.cases import Case
 from benches.peers.contenders import CONTENDERS
 from benches.peers.engines import Task
 from benches.warm import warm_up
+from saccade_lab.random_checkpoint.head import write_head
 
 
 def worker(pipe: Connection, name: str, case: Case, source: Path, scratch: Path) -> None:
@@ -105,29 +106,17 @@ def environment(added: dict[str, str]) -> Iterator[None]:
 
 
 def checkpoint(config: dict[str, Any], folder: Path) -> Path:
-    """Random weights, written in a separate process so that this one stays small."""
+    """Random weights, written under a temporary name if they are not there yet, then renamed."""
     if not folder.exists():
-        process = multiprocessing.get_context("spawn").Process(target=write, args=(config, folder))
-        process.start()
-        process.join()
-        if process.exitcode != 0:
-            raise SystemExit("latency: the weights could not be written")
+        part = folder.with_name(folder.name + ".part")
+        shutil.rmtree(part, ignore_errors=True)
+        part.mkdir(parents=True)
+        write_head(part, config)
+        part.rename(folder)
+        # While they are still written the rest is slower: on a Zen 5, 671 instead of 1080 chunks/s of one
+        # caller.
+        os.sync()
     return folder
-
-
-def write(config: dict[str, Any], folder: Path) -> None:
-    """Writes the checkpoint under a temporary name, then renames it."""
-    import torch
-
-    from saccade_lab.reference import random_weights
-
-    part = folder.with_name(folder.name + ".part")
-    shutil.rmtree(part, ignore_errors=True)
-    part.mkdir(parents=True)
-    random_weights.write_checkpoint(part, config, 0, through=torch.bfloat16)
-    part.rename(folder)
-    # While they are still written the rest is slower: on a Zen 5 671 instead of 1080 chunks/s of one caller.
-    os.sync()
 
 
 def note(message: str) -> None:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from benches.peers.cases import LINEAR_SHAPES, NUM_BLOCKS, WHOLE, Case
 from saccade import HeadConfig
+from saccade_lab.published import sized_config, small_config
 
 Arrays = dict[str, NDArray[Any]]
 EMBODIMENT = 1
@@ -27,12 +28,8 @@ def config_of(case: Case) -> dict[str, Any]:
     "Four blocks" is a head without VL self-attention and with a narrow output, so that an engine that only
     has whole heads does almost nothing except the blocks.
     """
-    from saccade_lab.reference import random_weights
-
-    if case.size == "small":
-        config = random_weights.small_config()
-    else:
-        config = random_weights.sized_config("n1.5", num_embodiments=NUM_EMBODIMENTS)
+    full = case.size != "small"
+    config = sized_config("n1.5", num_embodiments=NUM_EMBODIMENTS) if full else small_config()
     config["num_target_vision_tokens"] = case.num_future_tokens
     if case.piece == "blocks":
         config["diffusion_model_cfg"] |= {"num_layers": NUM_BLOCKS, "output_dim": 64}
@@ -90,17 +87,18 @@ def inputs_of(case: Case, config: HeadConfig) -> Arrays:
 def expected_of(case: Case, folder: Path) -> Arrays:
     """The inputs of the case, and as `expected` what `saccade_lab.reference` in float32 makes of them.
 
-    With the arrays of `times_of`. Of four blocks `rows` is what enters the first one; the noise is that of
+    With the arrays of `times_of`. torch is imported only if they are not there yet: a contender's process has
+    what it needs itself. Of four blocks `rows` is what enters the first one; the noise is that of
     one Euler step.
     """
-    import torch
-
-    from saccade_lab.reference import ActionHead
-
     path = folder / f"expected-{_slug(case)}.npz"
     if path.exists():
         with np.load(path) as held:
             return dict(held)
+    import torch
+
+    from saccade_lab.reference import ActionHead
+
     source = checkpoint(case, folder)  # also of the linear layers, which need nothing of it but its sizes
     arrays = inputs_of(case, HeadConfig.from_file(source / "config.json"))
     with torch.inference_mode():

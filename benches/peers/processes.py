@@ -168,11 +168,11 @@ def contenders(
     spawn = multiprocessing.get_context("spawn")
     pipes: dict[str, Connection] = {}
     said: dict[str, Ready | RuntimeError] = {}
+    ours: dict[str, Connection] = {}
     processes: dict[str, SpawnProcess] = {}
     try:
         note(f"{case}: building {', '.join(names)}")
         members = sharing(names)
-        ours: dict[str, Connection] = {}
         for first, together in members.items():
             ours[first], theirs = spawn.Pipe()
             process = spawn.Process(
@@ -195,7 +195,7 @@ def contenders(
                     note(f"{name} failed: {said[name]}")
         yield pipes, said
     finally:
-        for pipe in pipes.values():
+        for pipe in ours.values():  # also to those that are not ready, which wait, too
             with contextlib.suppress(OSError):
                 pipe.send(None)
         for process in processes.values():

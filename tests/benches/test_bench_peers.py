@@ -5,10 +5,7 @@ from __future__ import annotations
 import argparse
 import importlib
 import json
-import multiprocessing
 import signal
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -30,7 +27,6 @@ from benches.peers.throughput import throughput
 from saccade_lab.reference.random_weights import sized_config
 from saccade_lab.timing import Call, quartiles
 
-ROOT = Path(__file__).resolve().parents[2]
 N15 = saccade.HeadConfig.from_dict(sized_config("n1.5"))
 
 
@@ -213,20 +209,6 @@ def test_a_contender_that_was_killed_is_started_again(tmp_path: Path) -> None:
     assert batches(results, CASE, *names[:2], "--rounds", "3") == [["saccade-float32"]]
 
 
-def test_a_contender_that_is_killed_in_a_round_leaves_the_others(tmp_path: Path) -> None:
-    case = Case("head", 1, 7, 5, steps=1, size="small")
-    processes.prepare(case, tmp_path)
-    names = ["saccade-float32", "saccade-int8"]
-    with processes.contenders(names, case, tmp_path) as (pipes, said):
-        assert sorted(pipes) == sorted(names), said
-        doomed = next(each for each in multiprocessing.active_children() if each.name == "saccade-int8")
-        doomed.kill()
-        doomed.join()
-        seconds = processes.round_of(pipes, said, case.works, 0)
-    assert list(seconds) == list(pipes) == ["saccade-float32"]
-    assert set(seconds["saccade-float32"]) == set(case.works)
-
-
 def test_the_report_of_known_numbers(tmp_path: Path) -> None:
     results = measured(tmp_path / "results.json")
     rows = [line for line in report.overview(results).splitlines() if line.startswith("| saccade bf")]
@@ -403,45 +385,6 @@ def test_targets_where_there_are_tiles(tmp_path: Path) -> None:
     float32 = "| saccade float32, encode + sample, share of the floor | 2 threads | 85 % | 78 % | **no** |"
     assert float32 in rows
     assert goals.reached(0.9, 0.85, None) == "yes"
-
-
-def run(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
-    """`python -m benches.peers` at a small size."""
-    small = ["--size", "small", "--threads", "1", "--work", str(folder)]
-    if "policy" not in arguments:  # which has no choice of its sizes
-        small += ["--num-vl-tokens", "7"]
-    return subprocess.run(
-        [sys.executable, "-m", "benches.peers", *small, *arguments], cwd=ROOT, capture_output=True, text=True
-    )
-
-
-def test_it_runs_and_goes_on_where_it_stopped(tmp_path: Path) -> None:
-    chosen = ["--only", "head", "--contenders", "saccade-float32", "torch-float32", "saccade-bfloat16"]
-    done = run(tmp_path, *chosen, "--rounds", "1")
-    assert done.returncode == 0, done.stderr
-    first = json.loads((tmp_path / "results.json").read_text())
-    assert [list(record["contenders"]) for record in first["records"]] == [
-        ["saccade-float32"],
-        ["saccade-bfloat16"],
-        ["saccade-float32", "torch-float32"],
-    ]
-    entry = first["records"][2]["contenders"]["torch-float32"]
-    assert entry["error"] < 1e-4
-    assert {work: len(seconds) for work, seconds in entry["seconds"].items()} == dict.fromkeys(CASE.works, 1)
-    assert (tmp_path / "report.md").exists()
-
-    done = run(tmp_path, *chosen, "--rounds", "1")
-    assert done.returncode == 0, done.stderr
-    again = json.loads((tmp_path / "results.json").read_text())
-    assert again["records"] == first["records"]
-
-
-def test_a_contender_that_cannot_run_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("SACCADE_PEERS_GGML", str(tmp_path / "nowhere"))
-    done = run(tmp_path, "--only", "linear", "--contenders", "ggml-int8", "--linear-rounds", "0")
-    assert done.returncode == 0, done.stderr
-    (record,) = json.loads((tmp_path / "results.json").read_text())["records"]
-    assert "libggml-base.so" in record["contenders"]["ggml-int8"]["failed"]
 
 
 @pytest.mark.parametrize("wrong", [["--contenders", "jax"], ["--rounds", "0"], ["--only", "backbone"]])
