@@ -208,7 +208,9 @@ def bench_peers(session: nox.Session) -> None:
 def rounding(session: nox.Session) -> None:
     """Round a trained model to four bits, layer by layer; `report --write` writes the page of docs."""
     needs(session, "python", "rust")
-    environment = Environment(session, ENVIRONMENTS / "rounding").install("rounding").install_saccade().install_lab()
+    environment = (
+        Environment(session, ENVIRONMENTS / "rounding").install("rounding").install_saccade().install_lab()
+    )
     environment.run("-m", "benches.rounding", *session.posargs)
 
 
