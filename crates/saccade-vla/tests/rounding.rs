@@ -3,7 +3,7 @@
 
 use proptest::prelude::*;
 
-use saccade_vla::{Array, ErrorKind, Gram, Rounded, gptq, interruptible};
+use saccade_vla::{Array, ErrorKind, Gram, Rounded, RoundingErrors, gptq, interruptible};
 
 /// Numbers in -1 to 1 that look random.
 fn numbers(seed: u64, len: usize) -> Vec<f32> {
@@ -203,6 +203,31 @@ fn inputs_that_were_always_zero_are_rounded_for_themselves() {
     assert!(found.errors.rounded < 0.6 * found.errors.plain);
     let nothing = rounded(&weight, &scales, &Gram::new(width).unwrap(), 1);
     assert_eq!(nothing.values, plain, "no calibration at all");
+    assert_eq!(
+        nothing.errors,
+        RoundingErrors::default(),
+        "outputs of zero have no error"
+    );
+}
+
+#[test]
+fn inputs_whose_squares_are_no_normal_numbers_count_as_zero() {
+    let (width, rows) = (50, 100);
+    let mut x = inputs(3, rows, width);
+    let mut with_zeros = x.clone();
+    // Two of them, alike: the products of what is left of their digits would not be a sum of squares.
+    for (row, zeros) in x.chunks_exact_mut(width).zip(with_zeros.chunks_exact_mut(width)) {
+        (row[7], row[8]) = (1e-21 * row[7], 1e-21 * row[7]);
+        (zeros[7], zeros[8]) = (0.0, 0.0);
+    }
+    let tiny = gram(&x, width);
+    assert!(tiny.get(7, 7) > 0.0 && tiny.get(7, 7) < f32::MIN_POSITIVE);
+    let weight = numbers(4, 8 * width);
+    let scales = scales(&weight, width);
+    assert_eq!(
+        rounded(&weight, &scales, &tiny, 1),
+        rounded(&weight, &scales, &gram(&with_zeros, width), 1)
+    );
 }
 
 #[test]

@@ -27,6 +27,10 @@ const BLOCK: usize = 256;
 /// their outputs: 0.04, and 0.17 with a hundredth of the mean.
 const DAMPING: f64 = 0.01;
 
+/// An input whose square is below the normal numbers counts as one that was always zero: its products with others have
+/// lost their digits. Its weights are rounded for themselves, and their errors are none.
+const SMALLEST: f64 = f32::MIN_POSITIVE as f64;
+
 /// `G = (M D^1/2) (M D^1/2)^T` of a damped Gram matrix `G` whose inputs are sorted, those of the smallest squares
 /// first. Weights are rounded from the last input to the first.
 pub(super) struct Factor {
@@ -56,8 +60,7 @@ impl Factor {
                 *value = f64::from(gram.get(input, other));
             }
             row_of[row] = match row_of[row] {
-                // An input that was always zero: its weights are rounded for themselves.
-                0.0 => 1.0,
+                square if square < SMALLEST => 1.0,
                 square => square * (1.0 + DAMPING),
             };
         }
@@ -70,7 +73,8 @@ impl Factor {
         let mut roots = filled(WHAT, width, 0.0)?;
         for (row, values) in unit.chunks_exact_mut(width).enumerate() {
             roots[row] = values[row];
-            squares[row] = values[row] * values[row];
+            let is_zero = f64::from(gram.get(order[row], order[row])) < SMALLEST;
+            squares[row] = if is_zero { 0.0 } else { values[row] * values[row] };
             values[..=row]
                 .iter_mut()
                 .zip(&roots)
