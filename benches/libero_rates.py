@@ -23,7 +23,17 @@ from saccade_lab.intervals import wilson
 RECORD = Path(__file__).parent / "results" / "libero-rates.json"
 
 #: What is kept of a run, and what must be the same in all of them.
-COMMON = ("checkpoint", "options", "noise", "saccade", "instruction_set", "packages", "machine")
+COMMON = (
+    "checkpoint",
+    "options",
+    "noise",
+    "saccade",
+    "library",
+    "instruction_set",
+    "dot_products",
+    "packages",
+    "machine",
+)
 
 
 def record_of(runs: Sequence[Mapping[str, Any]]) -> dict[str, Any]:

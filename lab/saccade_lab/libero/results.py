@@ -13,8 +13,7 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
-import saccade
-from saccade._internal.environment import show_config
+from saccade._internal.environment import arithmetic
 from saccade._internal.files import write_json
 from saccade._internal.small_files import read_json
 from saccade.errors import InputError
@@ -34,7 +33,9 @@ SETTINGS = (
     "option_files",
     "noise",
     "saccade",
+    "library",
     "instruction_set",
+    "dot_products",
     "packages",
 )
 
@@ -270,12 +271,8 @@ def _decisive(protocol: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def software() -> dict[str, Any]:
-    """The settings that say what computes: saccade's version, instruction set, versions of packages."""
-    return {
-        "saccade": saccade.__version__,
-        "instruction_set": show_config("dicts")["isa"],
-        "packages": {name: _version(name) for name in PACKAGES},
-    }
+    """The settings that say what computes: ``arithmetic`` of saccade, and the versions of packages."""
+    return {**arithmetic(), "packages": {name: _version(name) for name in PACKAGES}}
 
 
 def _version(name: str) -> str | None:

@@ -13,6 +13,7 @@ import numpy as np
 
 import saccade
 from saccade._internal.arrays import Float32Array
+from saccade._internal.environment import arithmetic
 from saccade.errors import CheckpointError, InputError, ShapeError
 from saccade.head.intervention import Intervention
 from saccade.policy.interfaces import Head
@@ -291,12 +292,7 @@ class Policy:
             from saccade_lab.sim.torch_engine import describe
 
             return describe()
-        return {
-            "name": "rust",
-            "saccade": saccade.__version__,
-            "isa": saccade.show_config("dicts")["isa"],
-            "num_threads": self.head.num_threads,
-        }
+        return {"name": "rust", **arithmetic(), "num_threads": self.head.num_threads}
 
     def checkpoint_sha256(self) -> str:
         """SHA-256 of the policy's files, see ``checkpoint_identity``."""

@@ -40,7 +40,9 @@ SETTINGS: dict[str, Any] = {
     "option_files": {"tokenizer": {"name": "words.json", "sha256": "2" * 64}},
     "noise": {"seed": 0, "is_common": False},
     "saccade": "1.0",
+    "library": "0" * 12,
     "instruction_set": "avx2",
+    "dot_products": ["int8"],
     "packages": {"numpy": "2.0", "mujoco": "3.3.0"},
 }
 ABOUT: dict[str, Any] = {
@@ -162,7 +164,9 @@ def changed(path: tuple[str, ...], value: Any) -> dict[str, Any]:
         (("option_files",), {}, "options.tokenizer"),
         (("noise", "seed"), 1, "noise"),
         (("saccade",), "1.1", "saccade"),
+        (("library",), "1" * 12, "library"),
         (("instruction_set",), "avx512", "instruction_set"),
+        (("dot_products",), [], "dot_products"),
         (("packages", "mujoco"), "3.3.1", "packages.mujoco"),
     ],
 )
@@ -185,7 +189,10 @@ def test_names_do_not_matter_where_contents_are_equal(tmp_path: Path) -> None:
 def test_software_is_what_runs_here() -> None:
     found = software()
     assert found["saccade"] == saccade.__version__
-    assert found["instruction_set"] == saccade.show_config("dicts")["isa"]
+    config = saccade.show_config("dicts")
+    assert found["library"] == config["library"]
+    assert found["instruction_set"] == config["isa"]
+    assert found["dot_products"] == config["dot_products"]
     assert found["packages"]["numpy"] == np.__version__
     assert set(found) < set(SETTINGS)
 
