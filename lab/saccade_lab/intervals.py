@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from scipy.stats import binomtest
+import math
+from statistics import NormalDist
 
 from saccade._internal.bootstrap import CONFIDENCE
 from saccade.errors import InputError
@@ -22,5 +23,9 @@ def wilson(successes: int, trials: int) -> tuple[float, float]:
         raise InputError(f"successes: given {successes} of {trials} trials, expected 0 to {trials}")
     if trials == 0:
         return 0.0, 1.0
-    interval = binomtest(successes, trials).proportion_ci(CONFIDENCE, method="wilson")
-    return float(interval.low), float(interval.high)
+    z = NormalDist().inv_cdf((1 + CONFIDENCE) / 2)
+    rate = successes / trials
+    middle = 2 * trials * rate + z**2
+    half = z * math.sqrt(4 * trials * rate * (1 - rate) + z**2)
+    low, high = ((middle + side * half) / (2 * (trials + z**2)) for side in (-1, 1))
+    return (low if successes else 0.0), (high if successes < trials else 1.0)

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from scipy.stats import rankdata
+import scipy
 
 import saccade
 from saccade._internal.arrays import Float32Array
@@ -114,12 +114,12 @@ class Maps:
         """
         if self.occlusion is None:
             return None
-        cameras = self.view.layout.cameras
+        ranks, cameras = scipy.stats.rankdata, self.view.layout.cameras
         read = np.concatenate([keys[camera.positions] for camera in cameras])
         change = np.concatenate([self.occlusion.change[camera.name].ravel() for camera in cameras])
         if np.ptp(read) == 0 or np.ptp(change) == 0:
             return None
-        return float(np.corrcoef(rankdata(read), rankdata(change))[0, 1])
+        return float(np.corrcoef(ranks(read), ranks(change))[0, 1])
 
     def agreements(self) -> list[dict[str, Any]]:
         """``agreement`` of each group's mean map over heads and Euler steps, in cross-attention blocks."""

@@ -192,7 +192,7 @@ class CategoryLinear(nn.Module):
 
     def __init__(self, num_categories: int, in_features: int, out_features: int) -> None:
         super().__init__()
-        self.W = nn.Parameter(TABLE_STD * torch.randn(num_categories, in_features, out_features))
+        self.W = nn.Parameter(torch.randn(num_categories, in_features, out_features).mul_(TABLE_STD))
         self.b = nn.Parameter(torch.zeros(num_categories, out_features))
 
     def forward(self, x: Tensor, embodiment_id: int | Tensor) -> Tensor:
@@ -235,4 +235,4 @@ class ActionEncoder(nn.Module):
 
 def token_table(num_rows: int, width: int) -> nn.Embedding:
     """Learned rows, ``(num_rows, width)``. There may be none."""
-    return nn.Embedding(num_rows, width, _weight=TABLE_STD * torch.randn(num_rows, width))
+    return nn.Embedding(num_rows, width, _weight=torch.randn(num_rows, width).mul_(TABLE_STD))

@@ -72,7 +72,7 @@ def is_unused(name: str) -> bool:
 def hold_unused(head: nn.Module, name: str, config: HeadConfig) -> None:
     """Adds a parameter that only the released training uses to a head, with that code's initial value."""
     if name == MASK_TOKEN:
-        head.register_parameter(MASK_TOKEN, nn.Parameter(TABLE_STD * torch.randn(1, 1, config.width)))
+        head.register_parameter(MASK_TOKEN, nn.Parameter(torch.randn(1, 1, config.width).mul_(TABLE_STD)))
     else:
         sigmas = getattr(head, "task_log_sigma", nn.ParameterDict())
         sigmas[name.removeprefix(LOG_SIGMA)] = nn.Parameter(torch.zeros(()))

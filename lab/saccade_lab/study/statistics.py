@@ -8,8 +8,7 @@ from dataclasses import dataclass
 from typing import Literal, TypeAlias
 
 import numpy as np
-from scipy.optimize import brentq
-from scipy.stats import binomtest, nct, norm, t
+import scipy  # its parts are imported when they are used, which takes longer than most commands
 
 from saccade._internal.bootstrap import CONFIDENCE as CONFIDENCE
 from saccade._internal.bootstrap import Estimate as Estimate
@@ -122,7 +121,7 @@ def paired_difference(first: Sequence[bool], second: Sequence[bool]) -> PairedDi
         only_first=only_first,
         only_second=only_second,
         neither=int((~one & ~two).sum()),
-        p_value=float(binomtest(only_first, discordant).pvalue) if discordant else 1.0,
+        p_value=float(scipy.stats.binomtest(only_first, discordant).pvalue) if discordant else 1.0,
     )
 
 
@@ -140,7 +139,7 @@ def tango(only_first: float, only_second: float, pairs: int) -> Estimate:
         >>> [round(number, 4) for number in (found.value, found.low, found.high)]
         [-0.0621, -0.124, -0.0054]
     """
-    quantile = float(norm.ppf((1 + CONFIDENCE) / 2))
+    quantile = float(scipy.stats.norm.ppf((1 + CONFIDENCE) / 2))
     value = (only_first - only_second) / pairs
 
     def score(difference: float) -> float:
@@ -150,9 +149,13 @@ def tango(only_first: float, only_second: float, pairs: int) -> Estimate:
     edge = 1 - 1e-12
     low, high = -1.0, 1.0
     if score(-edge) > quantile:
-        low = float(brentq(lambda difference: score(difference) - quantile, -edge, min(value, edge)))
+        low = float(
+            scipy.optimize.brentq(lambda difference: score(difference) - quantile, -edge, min(value, edge))
+        )
     if score(edge) < -quantile:
-        high = float(brentq(lambda difference: score(difference) + quantile, max(value, -edge), edge))
+        high = float(
+            scipy.optimize.brentq(lambda difference: score(difference) + quantile, max(value, -edge), edge)
+        )
     return Estimate(value, low, high)
 
 
@@ -178,7 +181,7 @@ def p_of_loss(pairs: PairedDifference, loss: float) -> float:
         >>> close.difference.low > -0.05, p_of_loss(close, 0.05) < 0.025
         (True, True)
     """
-    return float(norm.sf(tango_score(pairs.only_first, pairs.only_second, pairs.pairs, -loss)))
+    return float(scipy.stats.norm.sf(tango_score(pairs.only_first, pairs.only_second, pairs.pairs, -loss)))
 
 
 def holm(p_values: Sequence[float]) -> list[float]:
@@ -222,13 +225,15 @@ def detectable_difference(pairs: int, discordant: float) -> float:
         raise InputError(
             f"pairs, discordant: given {pairs} and {discordant}, expected at least 1 and a fraction above 0"
         )
-    level, power = norm.ppf((1 + CONFIDENCE) / 2), norm.ppf(POWER)
+    level, power = scipy.stats.norm.ppf((1 + CONFIDENCE) / 2), scipy.stats.norm.ppf(POWER)
 
     def shortfall(difference: float) -> float:
         needed = level * math.sqrt(discordant) + power * math.sqrt(discordant - difference**2)
         return float(needed - difference * math.sqrt(pairs))
 
-    return float(brentq(shortfall, 0.0, discordant)) if shortfall(discordant) <= 0 else math.nan
+    return (
+        float(scipy.optimize.brentq(shortfall, 0.0, discordant)) if shortfall(discordant) <= 0 else math.nan
+    )
 
 
 def detectable_between_runs(rate: float, episodes: int, runs: int, run_deviation: float) -> float:
@@ -270,9 +275,9 @@ def detectable_between_runs(rate: float, episodes: int, runs: int, run_deviation
     if error == 0:
         return 0.0
     freedom = 2 * (runs - 1)
-    critical = t.ppf((1 + CONFIDENCE) / 2, freedom)
+    critical = scipy.stats.t.ppf((1 + CONFIDENCE) / 2, freedom)
 
     def shortfall(difference: float) -> float:
-        return POWER - float(nct.sf(critical, freedom, difference / error))
+        return POWER - float(scipy.stats.nct.sf(critical, freedom, difference / error))
 
-    return float(brentq(shortfall, 0.0, 1.0)) if shortfall(1.0) < 0 else math.nan
+    return float(scipy.optimize.brentq(shortfall, 0.0, 1.0)) if shortfall(1.0) < 0 else math.nan

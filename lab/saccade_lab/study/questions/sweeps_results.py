@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import pandas as pd
-from scipy import stats
+import scipy
 
 from saccade_lab.study.statistics import CONFIDENCE, Estimate, bootstrap, tango, wilson
 
@@ -57,7 +57,7 @@ def between_runs(first: Sequence[float], second: Sequence[float], episodes: int)
     if variance == 0:  # all runs always succeeded, or never
         return Estimate(value, math.nan, math.nan)
     error = math.sqrt(variance * (1 / len(first) + 1 / len(second)))
-    half = float(stats.t.ppf((1 + CONFIDENCE) / 2, freedom)) * error
+    half = float(scipy.stats.t.ppf((1 + CONFIDENCE) / 2, freedom)) * error
     return Estimate(value, max(value - half, -1.0), min(value + half, 1.0))
 
 
