@@ -15,6 +15,7 @@ from torch import Tensor, nn
 from saccade_lab.backbone_sizes import TextSizes
 from saccade_lab.reference.backbone.attention import attend, split_heads
 from saccade_lab.reference.backbone.rotary import rotate
+from saccade_lab.reference.backbone.tables import embedding
 
 
 class RmsNorm(nn.Module):
@@ -94,7 +95,7 @@ class Decoder(nn.Module):
 
     def __init__(self, sizes: TextSizes, num_layers: int, *, last_norm: bool) -> None:
         super().__init__()
-        self.embed_tokens = nn.Embedding(sizes.vocabulary, sizes.width)
+        self.embed_tokens = embedding(sizes.vocabulary, sizes.width)
         self.layers = nn.ModuleList(DecoderLayer(sizes) for _ in range(num_layers))
         if last_norm:
             self.norm = RmsNorm(sizes.width, sizes.eps)

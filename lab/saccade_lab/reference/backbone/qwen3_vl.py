@@ -14,6 +14,7 @@ from saccade.errors import InputError
 from saccade_lab.backbone_sizes import BackboneSizes, VisionSizes
 from saccade_lab.reference.backbone.attention import attend, split_heads
 from saccade_lab.reference.backbone.rotary import grid_angles, rotate
+from saccade_lab.reference.backbone.tables import embedding
 
 
 class PatchEmbedding(nn.Module):
@@ -112,7 +113,7 @@ class VisionTower(nn.Module):
         self.deepstack = vision.deepstack
         self.head_dim = vision.width // vision.num_heads
         self.patch_embed = PatchEmbedding(vision)
-        self.pos_embed = nn.Embedding(vision.num_positions, vision.width)
+        self.pos_embed = embedding(vision.num_positions, vision.width)
         self.blocks = nn.ModuleList(Block(vision) for _ in range(vision.num_layers))
         self.merger = Merger(sizes, norm_joined=False)
         self.deepstack_merger_list = nn.ModuleList(Merger(sizes, norm_joined=True) for _ in vision.deepstack)

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from saccade_lab.backbone_sizes import VisionSizes
 from saccade_lab.reference.backbone.attention import attend, split_heads
+from saccade_lab.reference.backbone.tables import embedding
 
 
 class ConvolutionEmbeddings(nn.Module):
@@ -20,7 +21,7 @@ class ConvolutionEmbeddings(nn.Module):
         super().__init__()
         side = sizes.patch_size
         self.patch_embedding = nn.Conv2d(3, sizes.width, kernel_size=side, stride=side)
-        self.position_embedding = nn.Embedding(sizes.num_positions, sizes.width)
+        self.position_embedding = embedding(sizes.num_positions, sizes.width)
 
     def forward(self, pixels: Tensor) -> Tensor:
         """``(V, 3, height, width)`` to ``(V, P, vision_width)``."""
@@ -35,7 +36,7 @@ class LinearEmbeddings(nn.Module):
         super().__init__()
         self.patch_size = sizes.patch_size
         self.patch_embedding = nn.Linear(3 * sizes.patch_size**2, sizes.width)
-        self.position_embedding = nn.Embedding(sizes.num_positions, sizes.width)
+        self.position_embedding = embedding(sizes.num_positions, sizes.width)
 
     def forward(self, pixels: Tensor) -> Tensor:
         """``(V, 3, height, width)`` to ``(V, P, vision_width)``."""
