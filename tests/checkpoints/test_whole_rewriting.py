@@ -90,13 +90,31 @@ def test_quantize_to_int4(layout: str, tmp_path: Path) -> None:
     for block in BLOCKS[layout]:
         weight, width = tensors[f"{block}.weight"], before[f"{block}.weight"].shape[1]
         assert (weight.dtype, weight.shape[1]) == (torch.uint8, (width + 1) // 2)
-    assert report.num_quantized_backbone == sum(tensor.dtype == torch.uint8 for tensor in tensors.values())
+    (table,) = (name for name, tensor in tensors.items() if tensor.dtype == torch.int8)
+    assert table.endswith(("embed_tokens.weight", "lm_head.weight"))  # tied in lerobot's
+    scale = before[table].float().abs().amax(dim=1) / 127
+    assert torch.allclose(tensors[f"{table}_scale"], scale, rtol=1e-6)
+    assert (tensors[table] * scale[:, None] - before[table]).abs().max() <= 0.5001 * scale.max()
+    added = [name for name in tensors if name not in before]
+    assert report.num_quantized_backbone == len(added)
     assert report.backbone_bytes_after == sum(tensor.nbytes for tensor in tensors.values())
     assert sidecars(out) == sidecars(source)
     for precision in ("int4", "int8"):
         policy = Policy.from_pretrained(out, embodiment=EMBODIMENT, precision=precision)
         assert str(policy.head).count(f"precision={precision}") == 1
     assert same(act(out, "int4"), act(source, "int4"))
+
+
+@pytest.mark.parametrize("precision", ["float32", "bfloat16"])
+def test_embeddings_in_int8_are_what_the_integers_represent(precision: str, tmp_path: Path) -> None:
+    source, out = whole("isaac"), tmp_path / "int4"
+    quantize(source, out, to="int4")
+    tensors = layouts.read(out, "")
+    (table,) = (name for name in tensors if name.endswith("embed_tokens.weight"))
+    tensors[table] = tensors[table] * tensors.pop(f"{table}_scale")[:, None]
+    widened = shutil.copytree(out, tmp_path / "widened")
+    save_file(tensors, widened / "model.safetensors")
+    assert same(act(out, precision), act(widened, precision))
 
 
 def test_quantize_may_keep_the_backbone(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -9,6 +9,13 @@ use crate::error::show_shape;
 /// What the name of a tensor's scales adds to its own: `X.weight` of int8 or int4 has `X.weight_scale`.
 pub const SCALE_SUFFIX: &str = "_scale";
 
+/// Types of a tensor that is stored as floating point alone.
+pub const NONE: &[Dtype] = &[];
+/// Types of a table whose rows are looked up: int8.
+pub const TABLE: &[Dtype] = &[Dtype::I8];
+/// Types of a linear layer's weight: int8, and int4, two elements of a row in a byte.
+pub const WEIGHT: &[Dtype] = &[Dtype::I8, Dtype::U8];
+
 /// A tensor that a checkpoint must hold.
 #[derive(Clone, Debug)]
 pub struct TensorSpec {
@@ -16,8 +23,8 @@ pub struct TensorSpec {
     pub name: String,
     /// Its shape.
     pub shape: Vec<usize>,
-    /// Whether it may be stored with a scale for each row: as int8 (I8), or as int4, two elements of a row in a byte (U8).
-    pub may_be_quantized: bool,
+    /// The types of whole numbers that it may be stored as, with a scale for each row: [`NONE`], [`TABLE`] or [`WEIGHT`].
+    pub quantized_types: &'static [Dtype],
     /// Whether its first axis counts equal layers, of which a row of a batch uses one.
     pub is_stacked: bool,
 }
@@ -29,7 +36,7 @@ impl TensorSpec {
         Self {
             name: name.to_owned(),
             shape: shape.to_vec(),
-            may_be_quantized: false,
+            quantized_types: NONE,
             is_stacked: false,
         }
     }
@@ -38,7 +45,7 @@ impl TensorSpec {
     #[must_use]
     pub fn shape_as(&self, dtype: Dtype) -> Vec<usize> {
         match self.shape.split_first() {
-            Some((&rows, rest)) if self.may_be_quantized && dtype == Dtype::U8 => {
+            Some((&rows, rest)) if dtype == Dtype::U8 && self.quantized_types.contains(&dtype) => {
                 vec![rows, rest.iter().product::<usize>().div_ceil(2)]
             }
             _ => self.shape.clone(),
@@ -99,7 +106,7 @@ pub fn problems<'a>(
                     show_shape(&spec.shape_as(dtype))
                 )));
             }
-            Some((dtype, _)) if spec.may_be_quantized && is_quantized(dtype) => {
+            Some((dtype, _)) if spec.quantized_types.contains(&dtype) => {
                 problems.extend(scale_problem(
                     &describe,
                     &name,
@@ -110,18 +117,18 @@ pub fn problems<'a>(
                 known.insert(scale);
             }
             Some((dtype, _)) if !is_readable(dtype) => {
-                let quantized = if spec.may_be_quantized {
-                    ", or I8 or U8 with its scale"
-                } else {
-                    ""
+                let quantized = match listed(spec.quantized_types) {
+                    types if types.is_empty() => types,
+                    types => format!(", or {types} with its scale"),
                 };
                 problems.push(TensorProblem::Other(format!(
                     "{name} is {dtype:?}, expected F32, BF16 or F16{quantized}"
                 )));
             }
-            Some((dtype, _)) if spec.may_be_quantized && describe(&scale).is_some() => {
+            Some((dtype, _)) if !spec.quantized_types.is_empty() && describe(&scale).is_some() => {
                 problems.push(TensorProblem::Other(format!(
-                    "{scale} is there, but {name} is {dtype:?}, expected I8 or U8"
+                    "{scale} is there, but {name} is {dtype:?}, expected {}",
+                    listed(spec.quantized_types)
                 )));
                 known.insert(scale);
             }
@@ -159,6 +166,11 @@ pub(crate) fn scale_problem<'a>(
         ))),
         Some(_) => None,
     }
+}
+
+fn listed(types: &[Dtype]) -> String {
+    let names: Vec<_> = types.iter().map(|dtype| format!("{dtype:?}")).collect();
+    names.join(" or ")
 }
 
 /// Whether a tensor of this type holds floating-point numbers that can be read.

@@ -52,6 +52,38 @@ fn what_is_written_can_be_read() {
 }
 
 #[test]
+fn long_runs_of_zeros_take_no_space() {
+    const LEN: usize = 1 << 20;
+    let mut numbers = vec![0_u8; LEN];
+    let used = [5, 70_000, 70_001, LEN - 1];
+    used.iter().for_each(|&place| numbers[place] = place as u8);
+    let parent = Temporary::new();
+    let out = parent.path().join("out");
+    let tensors = vec![planned("a", &[LEN / 4])];
+    let mut writer = CheckpointWriter::create(
+        &out,
+        tensors,
+        &BTreeMap::new(),
+        &Companions::default(),
+        u64::MAX,
+        false,
+    )
+    .unwrap();
+    for piece in numbers.chunks(100_003) {
+        writer.tensor("a", piece).unwrap();
+    }
+    let files = writer.finish().unwrap();
+    let path = out.join(&files[0]);
+    let written = std::fs::read(&path).unwrap();
+    assert!(written.ends_with(&numbers));
+    #[cfg(target_os = "linux")]
+    {
+        use std::os::unix::fs::MetadataExt;
+        assert!(512 * std::fs::metadata(path).unwrap().blocks() < LEN as u64 / 2);
+    }
+}
+
+#[test]
 fn of_two_writers_of_a_new_name_the_later_replaces_the_earlier_only_with_force() {
     for force in [false, true] {
         let parent = Temporary::new();

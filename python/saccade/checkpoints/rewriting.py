@@ -42,15 +42,14 @@ class QuantizeReport(Written):
     """What :func:`quantize` wrote."""
 
     num_quantized: int
-    """Number of weights that were converted to int8 or int4."""
+    """Number of weights that were converted to int8 or int4; with int4 also the token embeddings, to int8."""
     num_calibrated: int
     """How many of them were rounded for the observations of a calibration."""
     rounding: Mapping[str, Mapping[str, float]] | None
     """What rounding changed in each layer, by the name of its first weight; None without calibration. Sums
     over its outputs on the observations of the calibration: their squared error if each weight were rounded
     to the nearest (``plain``) and as they were rounded (``rounded``), and their squares (``outputs``). Each
-    counts what the rounding minimises: a hundredth of the square of each input for itself besides, and 1 for
-    an input that was always zero."""
+    counts what the rounding minimises: a hundredth of the square of each input for itself besides."""
     num_copied: int
     """Number of tensors that were copied bit for bit."""
     head_bytes_before: int
@@ -145,7 +144,8 @@ def quantize(
       four bits of a row's last byte are zero. The scale is the largest magnitude of the row / 7 times 1,
       11/12, ... or 5/12, whichever gives the least squared error. Each weight is rounded to the nearest
       integer; with ``calibration`` the integers are those that change the outputs of their layer least on
-      the observations (GPTQ, equation 55 of ``docs/equations.md``). The files say which.
+      the observations (GPTQ, equation 55 of ``docs/equations.md``). The files say which. The token embeddings
+      of a backbone become int8 as above, which is how both precisions hold them in memory.
 
     :meth:`saccade.ActionHead.from_pretrained`, :meth:`saccade.Backbone.from_pretrained` and
     :meth:`saccade.Policy.from_pretrained` read the copy at every precision. At the precision ``to``, and

@@ -29,9 +29,10 @@ HELP = "write a checkpoint with int8 or int4 weights"
 EPILOG = """\
 The weights X.weight of the attention and feed-forward layers of all blocks become int8, or with --to int4 two
 in a byte, with a float32 scale for each output in X.weight_scale: those of the head, and those of the
-backbone unless --keep-backbone or --head-only is given. All other tensors are copied bit for bit, and so are
-the other files of the checkpoint, such as statistics, processors and tokenizers. Policy.from_pretrained(DIR,
-precision="int8") gives the same bits as loading CHECKPOINT at int8, and so with int4 unless it is calibrated.
+backbone unless --keep-backbone or --head-only is given. With --to int4 its token embeddings become int8. All
+other tensors are copied bit for bit, and so are the other files of the checkpoint, such as statistics,
+processors and tokenizers. Policy.from_pretrained(DIR, precision="int8") gives the same bits as loading
+CHECKPOINT at int8, and so with int4 unless it is calibrated.
 The other precisions load it too, with the dequantized weights. docs/precision.md says how much they change
 actions.
 
@@ -102,8 +103,10 @@ def run(args: argparse.Namespace) -> int:
                 progress=lambda done, total: update(done // 10**6, total // 10**6, "writing, MB"),
                 **chosen,
             )
+    with_table = args.to == "int4" and report.num_quantized_backbone
+    stored = "int4, of which the token embeddings are in int8" if with_table else args.to
     lines = [
-        f"{args.out}: {report.num_quantized} weights in {args.to}, {report.num_copied} tensors copied, "
+        f"{args.out}: {report.num_quantized} weights in {stored}, {report.num_copied} tensors copied, "
         f"{report.num_dropped} left out; the head has {report.head_bytes_after / 1e6:.1f} MB "
         f"(was {report.head_bytes_before / 1e6:.1f} MB)"
     ]

@@ -21,6 +21,9 @@ use crate::error::{Error, Result};
 use replace::{Disk, check_replaceable, place, replace};
 use temporary::TemporaryDirectory;
 
+/// Bytes that are looked at together: if all are zero, they become a hole.
+const HOLE: usize = 1 << 16;
+
 /// A tensor to be written.
 #[derive(Clone, Debug)]
 pub struct PlannedTensor {
@@ -189,7 +192,8 @@ impl CheckpointWriter {
         write().map_err(|error| Error::writing(&path, error))
     }
 
-    /// Writes the next bytes of tensor `name`, one of the planned; tensors may come in any order.
+    /// Writes the next bytes of tensor `name`, one of the planned; tensors may come in any order. Long runs of zeros are
+    /// left out, as [`CheckpointWriter::zeros`] does: the layers of embodiments that a copy does not have.
     ///
     /// # Errors
     /// [`Error::Output`] if they cannot be written.
@@ -197,17 +201,16 @@ impl CheckpointWriter {
     /// # Panics
     /// If there is no such tensor, or it is shorter.
     pub fn tensor(&mut self, name: &str, bytes: &[u8]) -> Result<()> {
-        let region = self.regions.get_mut(name).expect("the tensor was planned");
-        let (shard, file) = &mut self.shards[region.shard];
-        let first = region.written;
-        region.written += bytes.len() as u64;
-        assert!(
-            region.written <= region.nbytes,
-            "{name}: more bytes than were planned"
-        );
-        file.seek(SeekFrom::Start(region.start + first))
-            .and_then(|_| file.write_all(bytes))
-            .map_err(|error| Error::writing(&self.temporary.path().join(shard), error))
+        for piece in bytes.chunks(HOLE) {
+            let first = self.passed(name, piece.len() as u64);
+            if piece.iter().any(|&byte| byte != 0) {
+                let (shard, file) = &mut self.shards[self.regions[name].shard];
+                file.seek(SeekFrom::Start(first))
+                    .and_then(|_| file.write_all(piece))
+                    .map_err(|error| Error::writing(&self.temporary.path().join(shard), error))?;
+            }
+        }
+        Ok(())
     }
 
     /// Leaves the next `nbytes` bytes of tensor `name` zero: a hole in the file, where the file system has such.
@@ -215,12 +218,19 @@ impl CheckpointWriter {
     /// # Panics
     /// As [`CheckpointWriter::tensor`].
     pub fn zeros(&mut self, name: &str, nbytes: u64) {
+        self.passed(name, nbytes);
+    }
+
+    /// Counts bytes as written; where in the file they are.
+    fn passed(&mut self, name: &str, nbytes: u64) -> u64 {
         let region = self.regions.get_mut(name).expect("the tensor was planned");
+        let first = region.start + region.written;
         region.written += nbytes;
         assert!(
             region.written <= region.nbytes,
             "{name}: more bytes than were planned"
         );
+        first
     }
 
     /// Gives the checkpoint its name; returns those of the files with tensors.

@@ -4,6 +4,7 @@
 use std::cell::Cell;
 
 use half::bf16;
+use saccade_vla_checkpoint::spec::{NONE, TABLE, WEIGHT};
 use saccade_vla_checkpoint::{Elements, TensorSpec};
 use saccade_vla_kernels::{Matrix, PackedLinear, WeightRef, quantize_rows};
 
@@ -71,7 +72,7 @@ impl Weights<'_> {
     pub(crate) fn weight(&self, role: Role, shape: &[usize]) -> Result<Tensor> {
         let weight = self.read(Request {
             spec: TensorSpec {
-                may_be_quantized: role.is_given_back(),
+                quantized_types: if role.is_given_back() { WEIGHT } else { NONE },
                 ..TensorSpec::plain(&self.name("weight"), shape)
             },
             slices: None,
@@ -106,11 +107,17 @@ impl Weights<'_> {
     /// The table `weight`, whose rows are looked up: as int8 with a scale for each row if that is what is
     /// computed in, in bf16 if that is how it is stored or what is computed in, else in float32.
     pub(crate) fn looked_up(&self, shape: [usize; 2]) -> Result<Tensor> {
-        let table = self.read(self.request("weight", &shape))?;
+        let mut request = self.request("weight", &shape);
+        request.spec.quantized_types = TABLE;
+        let table = self.read(request)?;
         let [rows, width] = shape;
         let is_int8 = self.engine().precision.quantizes_tables();
         let table = match table {
+            Tensor::Held(elements @ Elements::Int8 { .. }) if is_int8 => Tensor::Held(elements),
             Tensor::Held(elements) if is_int8 => quantized(&elements, shape)?,
+            Tensor::Held(elements @ Elements::Int8 { .. }) => {
+                Tensor::Held(Elements::F32(elements.into_f32()?)).rounded(self.engine())?
+            }
             table => table.rounded(self.engine())?,
         };
         self.count(match &table {

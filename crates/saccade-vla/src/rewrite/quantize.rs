@@ -1,8 +1,9 @@
 //! Quantised checkpoints: the weights that are multiplied in int8 or int4, stored so.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 
+use saccade_vla_checkpoint::spec::WEIGHT;
 use saccade_vla_checkpoint::{Checkpoint, CheckpointWriter, Dtype, PlannedTensor, TensorSpec};
 use saccade_vla_kernels::quantize_rows;
 
@@ -46,10 +47,12 @@ pub struct QuantizeReport {
 }
 
 /// Writes the checkpoint `source` to the directory `out` with the weights of the blocks' linear layers in the precision `to`: int8 as I8
-/// `X.weight (out, in)` by [`quantize_rows`], or int4 as U8 `X.weight (out, in / 2)`, rounded up, by [`quantize_rows_int4`](saccade_vla_kernels::quantize_rows_int4); and float32
+/// `X.weight (out, in)` by [`quantize_rows`], or int4 as U8 `X.weight (out, in / 2)`, rounded up, by [`quantize_rows_int4`]; and float32
 /// `X.weight_scale (out)`. That is what [`Precision::Int8`] and [`Precision::Int4`] compute with, so that loading the result at that precision
-/// gives the same bits as loading `source` at it. So are the blocks of a backbone, if there is one that [`Backbone`](crate::Backbone) loads.
-/// All other tensors are copied bit for bit.
+/// gives the same bits as loading `source` at it. So are the blocks of a backbone, if there is one that [`Backbone`](crate::Backbone) loads,
+/// and with int4 its token embeddings, as int8. All other tensors are copied bit for bit.
+///
+/// [`quantize_rows_int4`]: saccade_vla_kernels::quantize_rows_int4
 ///
 /// Weights in [`RewriteOptions::rounded`] are taken from there; [`round_layer`](crate::round_layer) writes such for the inputs of a layer.
 ///
@@ -85,9 +88,12 @@ pub fn quantize(
         source,
         backbone,
         weights,
-    } = Quantizing::open(source, options)?;
+    } = Quantizing::open(source, to, options)?;
     let rounded = RoundedWeights::open(&options.rounded)?;
-    if let Some(name) = rounded.names().find(|&name| !weights.quantized.contains(name)) {
+    if let Some(name) = rounded
+        .names()
+        .find(|&name| weights.stored_as(name) != Some(Dtype::U8))
+    {
         bail!(Input, "rounded"; expected "weights that are quantised"; got "{name}");
     }
     let backbone_prefix = weights.backbone_prefix;
@@ -99,13 +105,13 @@ pub fn quantize(
     };
     for name in source.names(options) {
         let is_backbone = backbone_prefix.is_some_and(|prefix| name.starts_with(prefix));
-        let tensors = if weights.quantized.contains(name) {
+        let tensors = if let Some(dtype) = weights.stored_as(name) {
             report.num_quantized += 1;
             report.num_quantized_backbone += usize::from(is_backbone);
             let [out_features, in_features] = sizes_of(&source, name);
-            match to {
-                Precision::Int4 => planned_int4(name, out_features, in_features),
-                _ => planned_with_scales(name, Dtype::I8, [out_features, in_features]),
+            match dtype {
+                Dtype::U8 => planned_int4(name, out_features, in_features),
+                _ => planned_with_scales(name, dtype, [out_features, in_features]),
             }
             .to_vec()
         } else {
@@ -130,16 +136,16 @@ pub fn quantize(
         &config,
         planned,
         &mut progress,
-        |name, writer| match weights.quantized.contains(name) {
-            true => write_quantized(&source, name, to, &rounded, writer),
-            false if weights.all.contains(name) => copy_finite(&source.checkpoint, name, writer),
-            false => source.copy(name, writer),
+        |name, writer| match weights.stored_as(name) {
+            Some(dtype) => write_quantized(&source, name, dtype, &rounded, writer),
+            None if weights.all.contains_key(name) => copy_finite(&source.checkpoint, name, writer),
+            None => source.copy(name, writer),
         },
     )?;
     Ok(report)
 }
 
-/// The weights that [`quantize`] rounds.
+/// The weights that [`quantize`] rounds to four bits.
 #[derive(Clone, Debug)]
 pub struct QuantizedWeights {
     /// What the names of the head's tensors begin with.
@@ -150,17 +156,21 @@ pub struct QuantizedWeights {
     pub names: BTreeSet<String>,
 }
 
-/// Which weights [`quantize`] would round, with the same arguments. Reads no tensor and leaves nothing.
+/// Which weights [`quantize`] would round to int4, with the same arguments. Reads no tensor and leaves nothing.
 ///
 /// # Errors
 /// Those of [`quantize`] that can be known so far, also of `out`.
 pub fn quantized_weights(source: &Path, out: &Path, options: &RewriteOptions) -> Result<QuantizedWeights> {
-    let Quantizing { source, weights, .. } = Quantizing::open(source, options)?;
+    let Quantizing { source, weights, .. } = Quantizing::open(source, Precision::Int4, options)?;
     source.check_out(out, options.force)?;
     Ok(QuantizedWeights {
         head_prefix: source.prefix,
         backbone_prefix: weights.backbone_prefix,
-        names: weights.quantized,
+        names: weights
+            .all
+            .into_iter()
+            .filter_map(|(name, dtype)| (dtype == Some(Dtype::U8)).then_some(name))
+            .collect(),
     })
 }
 
@@ -173,18 +183,18 @@ struct Quantizing {
 }
 
 impl Quantizing {
-    fn open(source: &Path, options: &RewriteOptions) -> Result<Self> {
+    fn open(source: &Path, to: Precision, options: &RewriteOptions) -> Result<Self> {
         let source = SourceCheckpoint::open(source, options.config.as_deref())?;
         let backbone = backbone_of(&source, options)?;
         let mut weights = Names::default();
-        weights.add(source.prefix, &tensor_specs(&source.config)?);
+        weights.add(source.prefix, &tensor_specs(&source.config)?, to);
         if let Ok(Some(backbone)) = &backbone {
-            weights.add(backbone.prefix(), backbone.specs());
+            weights.add(backbone.prefix(), backbone.specs(), to);
             weights.backbone_prefix = Some(backbone.prefix());
         }
-        for name in &weights.quantized {
+        for (name, dtype) in &weights.all {
             // What the source has none of is found where the tensors are listed.
-            if source.checkpoint.dtype(name).is_ok() {
+            if dtype.is_some() && source.checkpoint.dtype(name).is_ok() {
                 check_not_quantized(&source.checkpoint, name)?;
             }
         }
@@ -199,22 +209,27 @@ impl Quantizing {
 /// Tensors of models, by their names in the checkpoint.
 #[derive(Default)]
 struct Names {
-    all: BTreeSet<String>,
-    /// Those that may be stored as int8 or int4.
-    quantized: BTreeSet<String>,
+    /// With the type that [`quantize`] stores each as; none of those that are copied.
+    all: BTreeMap<String, Option<Dtype>>,
     /// What the names of a backbone's begin with, if there is one that is quantised.
     backbone_prefix: Option<&'static str>,
 }
 
 impl Names {
-    fn add(&mut self, prefix: &str, specs: &[TensorSpec]) {
+    fn add(&mut self, prefix: &str, specs: &[TensorSpec], to: Precision) {
         for spec in specs {
-            let name = format!("{prefix}{}", spec.name);
-            if spec.may_be_quantized {
-                self.quantized.insert(name.clone());
-            }
-            self.all.insert(name);
+            let dtype = match to {
+                Precision::Int4 => spec.quantized_types.last().copied(),
+                // Tables stay as they are, although a model in int8 holds them as int8.
+                _ => (spec.quantized_types == WEIGHT).then_some(Dtype::I8),
+            };
+            self.all.insert(format!("{prefix}{}", spec.name), dtype);
         }
+    }
+
+    /// The type that a tensor is stored as; none if it is copied.
+    fn stored_as(&self, name: &str) -> Option<Dtype> {
+        self.all.get(name).copied().flatten()
     }
 }
 
@@ -241,7 +256,7 @@ fn backbone_of(
 fn write_quantized(
     source: &SourceCheckpoint,
     name: &str,
-    to: Precision,
+    dtype: Dtype,
     rounded: &RoundedWeights,
     writer: &mut CheckpointWriter,
 ) -> Result<()> {
@@ -251,7 +266,7 @@ fn write_quantized(
         Some(found) => found,
         None => {
             let weight = source.checkpoint.read(name)?;
-            if to == Precision::Int4 {
+            if dtype == Dtype::U8 {
                 plain_int4(&weight, out_features, in_features)?
             } else {
                 let mut scales = filled("source", out_features, 0.0)?;
@@ -265,7 +280,7 @@ fn write_quantized(
             }
         }
     };
-    let most = if to == Precision::Int4 { 7.0 } else { 127.0 };
+    let most = if dtype == Dtype::U8 { 7.0 } else { 127.0 };
     if let Some(row) = scales.iter().position(|scale| !(most * scale).is_finite()) {
         bail!(Checkpoint, "source"; "{name} holds NaN or infinity in row {row}, expected finite weights");
     }
