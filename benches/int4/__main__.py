@@ -3,7 +3,7 @@
     python -m benches.int4 errors [--small] [--policy DIR]  of actions, by precision and by group of layers
     python -m benches.int4 loop [--policy DIR]              success in closed loop on the same episodes
     python -m benches.int4 full [CHECKPOINT]                memory, loading and time at N1.5's published size
-    python -m benches.int4 calibrate [CHECKPOINT]           how long its calibration takes
+    python -m benches.int4 calibrate [CHECKPOINT]           how long its calibration takes, and its errors
     python -m benches.int4 report [--write]                 prints the page, or writes docs/results/int4.md
 
 Each adds to out/int4.json what it measured; the report has the committed measurements for the rest. Needs the
@@ -76,9 +76,10 @@ def full(args: argparse.Namespace) -> dict[str, Any]:
 
 
 def calibrate(args: argparse.Namespace) -> dict[str, Any]:
-    """How long calibration takes at published size."""
+    """How long calibration takes at published size, and the errors of actions."""
     checkpoint = n15(args.work, small=False, given=args.checkpoint)
-    return size.calibrate(checkpoint, args.work, args.num_threads, note)
+    found = size.calibrate(checkpoint, args.work, args.num_threads, note)
+    return found | {"errors": accuracy.measure(*size.calibrated(args.work), note)}
 
 
 MEASUREMENTS = {"errors": errors, "loop": loop, "full": full, "calibrate": calibrate}

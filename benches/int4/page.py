@@ -37,6 +37,7 @@ The same policies, one observation at a time, by turns in one process: medians, 
 of one round with its quartiles. The first part is from images to the context of the head, the second a chunk
 from a held context."""
 
+NAME = "N1.5 at its published size, random weights"
 SIZES = ("file, GB", "weights, GB", "peak at loading, GB", "peak with a call, GB", "loading, s", "reading, s")
 
 
@@ -83,7 +84,12 @@ def calibration_section(measured: Mapping[str, Any]) -> list[str]:
         f"({measured['weights']} weights): {measured['seconds'] / 60:.1f} minutes, and at most "
         f"{measured['peak'] / 1e9:.1f} GB of memory."
     )
-    return ["## Calibration", words]
+    parts = ["## Calibration", words]
+    return [
+        *parts,
+        "Errors as above, on others of its random observations:",
+        errors({NAME: measured["errors"]}),
+    ]
 
 
 SECTIONS: dict[str, Callable[[Mapping[str, Any]], list[str]]] = {

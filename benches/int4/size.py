@@ -10,13 +10,13 @@ from typing import Any
 import saccade
 from benches.backbone.memory import measure as measure_loading
 from benches.backbone.memory import peak_memory
-from benches.int4.accuracy import Note
+from benches.int4.accuracy import Model, Note
 from saccade.checkpoints import Calibration, convert, quantize
 
 #: Loads of each, by turns.
 ROUNDS = 3
-#: Observations that weights are rounded for.
-CALIBRATED = 16
+#: Observations that weights are rounded for, and others that errors are measured on.
+CALIBRATED, MEASURED = 16, 4
 
 
 def measure(checkpoint: Path, work: Path, threads: int, note: Note) -> dict[str, Any]:
@@ -63,6 +63,16 @@ def calibrate(checkpoint: Path, work: Path, threads: int, note: Note) -> dict[st
         found: dict[str, Any] = pool.apply(_calibrate, (one, work / "calibrated-full", threads))
     note(f"calibration: {found}")
     return found
+
+
+def calibrated(work: Path) -> tuple[Model, dict[str, Path]]:
+    """What `calibrate` made, as `accuracy.measure` takes it, beside a copy with plain rounding."""
+    one, plain = work / "one-embodiment", work / "int4"
+    quantize(one, plain, to="int4", force=True)
+    policy = saccade.Policy.from_pretrained(one)
+    observations = [policy.example_observation(seed=CALIBRATED + seed) for seed in range(MEASURED)]
+    folders = {"int4": plain, "int4, calibrated": work / "calibrated-full"}
+    return Model("N1.5 at its published size", one, [], observations), folders
 
 
 def _calibrate(checkpoint: Path, out: Path, threads: int) -> dict[str, Any]:

@@ -42,7 +42,7 @@ def record() -> dict[str, Any]:
             },
             "time": {"sample": {"int8": [0.2, 0.4, 0.2], "int4": [0.1, 0.4, 0.18]}},
         },
-        "calibrate": {"observations": 16, "weights": 400, "seconds": 90.0, "peak": 7e9},
+        "calibrate": {"observations": 16, "weights": 400, "seconds": 90.0, "peak": 7e9, "errors": RUNS},
     }
     return {word: {"machine": MACHINE, "measured": one} for word, one in measured.items()}
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ from PIL import Image
 
 import saccade
 from saccade import InputError, cli
+from saccade.checkpoints import quantize
 from saccade.checkpoints.precisions import (
     DEVIATIONS,
     NUM_SAMPLES,
@@ -72,6 +74,43 @@ def test_the_numbers_are_those_of_the_policy(layout: str, frames: Path) -> None:
     assert others[-1].actions.largest == pytest.approx(largest)
 
 
+def test_a_rounded_checkpoint_is_compared_with_what_it_was_made_from(
+    frames: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    source, out = whole("isaac"), tmp_path / "int4"
+    quantize(source, out, to="int4")
+    options: dict[str, Any] = {"instruction": "open it", "embodiment": EMBODIMENT, "num_threads": 1}
+    original = check_precisions(source, frames, **options)
+    alone = check_precisions(out, frames, **options)
+    found = check_precisions(out, frames, reference=source, **options)
+    assert (original.is_quantized, alone.is_quantized, found.is_quantized) == (False, True, True)
+    assert (alone.reference, found.reference) == (None, str(source))
+    # The integers are those that the original has in int4; in float32 they are what they represent.
+    expected, int4 = original.precisions[-1], found.precisions[-1]
+    assert (int4.features, int4.actions) == (expected.features, expected.actions)
+    assert found.precisions[0].features > 0.0
+    assert found.other_noise == original.other_noise
+    assert alone.precisions[0].features == 0.0
+    assert alone.precisions[-1].features < int4.features
+    command = ["inspect", str(out), "--precision-check", str(frames), "--instruction", "open it"]
+    command += ["--embodiment", EMBODIMENT, "--num-threads", "1"]
+    assert cli.main(command) == 0
+    assert "--reference CHECKPOINT compares with what it was made from" in capsys.readouterr().out
+    assert cli.main([*command, "--reference", str(source)]) == 0
+    printed = capsys.readouterr().out
+    assert "--reference CHECKPOINT" not in printed
+    assert "Difference from float32 of" in printed
+
+
+def test_a_reference_of_another_robot_is_refused(frames: Path, tmp_path: Path) -> None:
+    source = whole("isaac")
+    other = Path(shutil.copytree(source, tmp_path / "other"))
+    path = other / "experiment_cfg" / "metadata.json"
+    path.write_text(path.read_text().replace('"arm"', '"leg"'))
+    with pytest.raises(InputError, match="reference: expected one whose actions are those of source"):
+        check_precisions(source, frames, reference=other, instruction="open it", embodiment=EMBODIMENT)
+
+
 def test_ranges_are_those_of_the_statistics() -> None:
     first, second = np.array([-1.0, 2.0, 5.0]), np.array([3.0, 2.5, 5.0])
     moving = np.array([True, True, False])
@@ -109,7 +148,8 @@ def test_the_smallest_that_is_close_is_recommended() -> None:
     assert recommended([*rows[:2], row("int8", 0.01, 100)]) == "int8"
     assert recommended([rows[0], rows[2]]) == "float32"
     assert recommended([rows[0], row("int8", float("nan"), 100)]) == "float32"
-    assert recommended([*rows, row("int4", 0.0, 50)]) == "bfloat16"  # no closed loop was run with it
+    assert recommended([*rows, row("int4", 0.0, 50)]) == "int4"
+    assert recommended([rows[2]]) is None
 
 
 def test_the_command(frames: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -135,7 +175,7 @@ def test_what_cannot_be_checked_is_refused(
     for arguments, message in (
         (["--instruction", "open it"], "--instruction: only with --precision-check"),
         (["--seed", "1", "--num-threads", "1"], "--seed, --num-threads: only with --precision-check"),
-        (["--precision-check", str(frames), "--reference", source], "--reference: not with"),
+        (["--precision-check", str(frames), "--config", source], "--config: not with"),
         (["--precision-check", str(tmp_path / "none"), "--embodiment", EMBODIMENT], "no such directory"),
     ):
         assert cli.main(["inspect", source, *arguments]) == 2

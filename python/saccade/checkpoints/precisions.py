@@ -14,6 +14,8 @@ import numpy as np
 import numpy.typing as npt
 
 from saccade._internal.arrays import Float32Array, integer
+from saccade.checkpoints.description import describe
+from saccade.errors import InputError
 from saccade.observations.pictures import PictureObservation, read_frames
 from saccade.policy.policy import Policy
 from saccade.processor import Preprocessing
@@ -32,11 +34,9 @@ PRECISIONS: Mapping[str, Mapping[str, str]] = MappingProxyType(
 
 #: Largest difference of an action, relative to its range, at which a precision is recommended: a convention.
 #: int8 stays below it in the small policies that were tested, and 300 paired episodes of a sensitive task
-#: excluded that int8 costs 2 points of success (docs/precision.md). Nothing larger was tested in closed loop.
+#: excluded that int8 costs 2 points of success (docs/precision.md). int4, which is above it, cost up to 2
+#: points of 300 episodes (docs/results/int4.md).
 TOLERANCE = 0.01
-
-#: Precisions that are compared and not recommended, however close they are: no closed loop was run with them.
-UNTRIED = ("int4",)
 
 #: Number of chunks that are compared for each observation, from different noise.
 NUM_SAMPLES = 4
@@ -90,9 +90,14 @@ class PrecisionCheck:
     other_noise: Difference
     """Of float32 with itself, from other noise: how much the policy leaves to chance."""
     tolerance: float
-    recommended: str
+    recommended: str | None
     """The name of the precision with the smallest weights among those whose actions differ by at most
-    ``tolerance`` of the range. Never int4, with which no closed loop was run."""
+    ``tolerance`` of the range; None if there is none, which only a reference can cause."""
+    reference: str | None
+    """The checkpoint whose float32 everything is compared with; None for that of ``source`` itself."""
+    is_quantized: bool
+    """Whether weights of ``source`` are int8 or int4. Without a reference, what rounding them has changed is
+    in none of the differences."""
 
 
 @dataclass(frozen=True)
@@ -108,6 +113,7 @@ def check_precisions(
     source: str | os.PathLike[str],
     directory: Path,
     *,
+    reference: str | os.PathLike[str] | None = None,
     instruction: str | None = None,
     state: Path | None = None,
     embodiment: str | int | None = None,
@@ -127,6 +133,8 @@ def check_precisions(
     Args:
         source: The checkpoint, as for :meth:`saccade.Policy.from_pretrained`.
         directory: Pictures, as :func:`saccade.observations.pictures.read_frames` reads them.
+        reference: The checkpoint whose float32 is the exact result, such as the one that ``source`` was
+            quantised from. Default: ``source``.
         instruction, state: As for :func:`saccade.observations.pictures.read_frames`.
         embodiment, preprocessing, tokenizer, data_config, action_horizon, processor_options, num_threads: As
             for :meth:`saccade.Policy.from_pretrained`.
@@ -136,6 +144,7 @@ def check_precisions(
     Raises:
         FileNotFoundError, CheckpointError, InputError, ShapeError, DtypeError: As
             :meth:`saccade.Policy.from_pretrained` and :func:`saccade.observations.pictures.read_frames`.
+        InputError: The actions of ``reference`` have other keys or sizes than those of ``source``.
 
     Example:
         >>> from pathlib import Path
@@ -144,15 +153,10 @@ def check_precisions(
         ...     return check_precisions(checkpoint, Path("frames"), instruction="open the drawer").recommended
     """
     seed = integer("seed", seed, least=0)
-    recorded: list[PictureObservation] = []
-    found: list[PrecisionError] = []
-    exact: _Results | None = None
-    other_noise = Difference({}, {})
-    for index, (name, precision) in enumerate(PRECISIONS.items()):
-        if progress is not None:
-            progress(index, len(PRECISIONS))
-        policy = Policy.from_pretrained(
-            source,
+
+    def load(checkpoint: str | os.PathLike[str], precision: Mapping[str, str]) -> Policy:
+        return Policy.from_pretrained(
+            checkpoint,
             embodiment=embodiment,
             preprocessing=preprocessing,
             tokenizer=tokenizer,
@@ -162,13 +166,23 @@ def check_precisions(
             precision=precision,
             num_threads=num_threads,
         )
-        groups = policy.normalizer.action_groups
-        if exact is None:
-            recorded = read_frames(directory, policy, instruction=instruction, state=state)
-            results = exact = run(policy, recorded, seed)
-            others = run(policy, recorded, seed + len(recorded))
-            other_noise = difference(exact.actions, others.actions, groups)
-        else:
+
+    first, first_precision = next(iter(PRECISIONS.items()))
+    policy = load(source if reference is None else reference, first_precision)
+    groups = policy.normalizer.action_groups
+    recorded = read_frames(directory, policy, instruction=instruction, state=state)
+    exact = run(policy, recorded, seed)
+    others = run(policy, recorded, seed + len(recorded))
+    other_noise = difference(exact.actions, others.actions, groups)
+    found: list[PrecisionError] = []
+    for index, (name, precision) in enumerate(PRECISIONS.items()):
+        if progress is not None:
+            progress(index, len(PRECISIONS))
+        results = exact
+        if reference is not None or name != first:
+            del policy  # before the next one is loaded
+            policy = load(source, precision)
+            _check_actions(groups, policy.normalizer.action_groups)
             results = run(policy, recorded, seed)
         found.append(
             PrecisionError(
@@ -180,7 +194,6 @@ def check_precisions(
                 milliseconds=results.milliseconds,
             )
         )
-        del policy  # before the next one is loaded
     return PrecisionCheck(
         source=os.fspath(source),
         observations=len(recorded),
@@ -189,13 +202,22 @@ def check_precisions(
         other_noise=other_noise,
         tolerance=TOLERANCE,
         recommended=recommended(found),
+        reference=None if reference is None else os.fspath(reference),
+        is_quantized=any(tensor.dtype in ("I8", "U8") for tensor in describe(source).tensors),
     )
 
 
-def recommended(found: Sequence[PrecisionError]) -> str:
-    """The name of the smallest whose actions differ by at most `TOLERANCE` of the range, and was tried."""
-    close = [one for one in found if one.actions.worst <= TOLERANCE and one.name not in UNTRIED]
-    return min(close, key=lambda one: one.nbytes).name
+def _check_actions(expected: Sequence[Group], found: Sequence[Group]) -> None:
+    """Checks that two checkpoints control the same robot."""
+    sizes, others = ({group.key: group.size for group in groups} for groups in (expected, found))
+    if sizes != others:
+        raise InputError(f"reference: expected one whose actions are those of source, {others}, got {sizes}")
+
+
+def recommended(found: Sequence[PrecisionError]) -> str | None:
+    """The name of the smallest whose actions differ by at most `TOLERANCE` of the range; None without one."""
+    close = [one for one in found if one.actions.worst <= TOLERANCE]
+    return min(close, key=lambda one: one.nbytes).name if close else None
 
 
 def run(policy: Policy, recorded: Sequence[PictureObservation], seed: int) -> _Results:

@@ -30,7 +30,8 @@ docs/checkpoint-tools.md explains when that happens.
 
 With --precision-check it runs the whole checkpoint instead, at every precision on the same images from the
 same noise, compares features and actions with float32, and recommends the smallest precision whose actions
-differ by at most 1 % of their range. docs/precision.md says why.
+differ by at most 1 % of their range. docs/precision.md says why. With --reference all are compared with the
+float32 of that checkpoint: what a checkpoint of `saccade quantize` has lost.
 
 examples:
   saccade inspect GR00T-N1.5-3B/
@@ -38,6 +39,7 @@ examples:
   saccade inspect my-fork/ --reference GR00T-N1.5-3B/  is it still the checkpoint that it started from?
   saccade inspect GR00T-N1.5-3B/ --data-config fourier_gr1_arms_only    what this data config needs
   saccade inspect my-policy/ --precision-check frames/ --instruction "open the drawer"
+  saccade inspect my-int4/ --reference my-policy/ --precision-check frames/ --instruction "open the drawer"
 """
 
 
@@ -48,7 +50,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     arguments.add_config(parser)
     add_data_config(parser)
     parser.add_argument(
-        "--reference", type=Path, metavar="PATH", help="checkpoint to compare with, tensor by tensor"
+        "--reference",
+        type=Path,
+        metavar="PATH",
+        help="checkpoint to compare with, tensor by tensor or in actions",
     )
     arguments.add_json(parser, "print JSON instead of tables")
     seen = parser.add_argument_group("compare the precisions on images and an instruction")

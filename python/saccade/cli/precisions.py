@@ -22,9 +22,8 @@ ARGUMENTS = (
 
 def run(args: argparse.Namespace) -> int:
     """Compares, prints and recommends."""
-    for name in ("config", "reference"):
-        if getattr(args, name) is not None:
-            raise UsageError(f"--{name}: not with --precision-check")
+    if args.config is not None:
+        raise UsageError("--config: not with --precision-check")
     require("inspect --precision-check")
     from saccade.checkpoints.precisions import check_precisions
 
@@ -32,6 +31,7 @@ def run(args: argparse.Namespace) -> int:
         found = check_precisions(
             args.checkpoint,
             args.precision_check,
+            reference=args.reference,
             instruction=args.instruction,
             state=args.state,
             **loading_options(args),
@@ -42,10 +42,16 @@ def run(args: argparse.Namespace) -> int:
         output.print_json(dataclasses.asdict(found), indent=1)
         return EXIT_OK
     show([overview(found), by_key(found)])
-    print(
-        f"recommended: {found.recommended}, the smallest whose actions differ by at most "
-        f"{found.tolerance:.0%} of their range (int4 is not: no closed loop was run with it)"
-    )
+    close = f"actions differ by at most {found.tolerance:.0%} of their range"
+    if found.recommended is None:
+        print(f"recommended: none of these, since there is none whose {close}")
+    else:
+        print(f"recommended: {found.recommended}, the smallest whose {close}")
+    if found.is_quantized and found.reference is None:
+        print(
+            "The weights of this checkpoint are rounded already, and what that has changed is in none of "
+            "these differences. --reference CHECKPOINT compares with what it was made from."
+        )
     return EXIT_OK
 
 
@@ -63,8 +69,9 @@ def overview(found: PrecisionCheck) -> Section:
     ]
     rows.append(["float32, other noise", "-", of_range(found.other_noise), "-", "-"])
     count = f"{found.observations} observations, {found.samples} chunks of each, same noise"
+    of = "" if found.reference is None else f" of {found.reference}"
     columns = ["", ">error of features", ">largest of an action, of its range", ">MB", ">ms"]
-    return Section(f"Difference from float32: {count}", columns, rows)
+    return Section(f"Difference from float32{of}: {count}", columns, rows)
 
 
 def by_key(found: PrecisionCheck) -> Section:
