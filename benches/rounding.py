@@ -272,9 +272,9 @@ def document(record: dict[str, Any]) -> str:
 
 
 TEXT = """\
-The error of each layer's outputs, relative to the outputs (root of the sums of squares), of all-
-MiniLM-L6-v2, a trained sentence transformer, on paragraphs of Python's language reference. Calibration saw
-other paragraphs of it. Only weights are rounded, so that the columns differ in nothing else.
+The error of each layer's outputs, relative to the outputs (root of the sums of squares), of
+all-MiniLM-L6-v2, a trained sentence transformer, on paragraphs of Python's language reference. Calibration
+saw other paragraphs of it. Only weights are rounded, so that the columns differ in nothing else.
 
 - *int8*: a scale for each output, as `precision="int8"`.
 - *plain, by range*: four bits, -7 to 7, by the largest weight of each output.

@@ -43,13 +43,22 @@ def note(line: str) -> None:
 
 def policies(args: argparse.Namespace) -> list[accuracy.Trained]:
     """The bundled policy, and those that are named."""
-    return [accuracy.trained(folder, args.work) for folder in (saccade.demo_checkpoint(), *args.policy)]
+    found = [accuracy.trained(folder, args.work) for folder in (saccade.demo_checkpoint(), *args.policy)]
+    names = [one.name for one in found]
+    if len(set(names)) < len(names):
+        raise SystemExit(f"benches.int4: --policy: expected policies of other tasks, got {', '.join(names)}")
+    return found
 
 
 def errors(args: argparse.Namespace) -> dict[str, Any]:
     """Errors of actions."""
-    found: dict[str, Any] = {"models": {}, "groups": {}}
     trained, others = policies(args), accuracy.random_models(args.work, small=args.small)
+    found: dict[str, Any] = {
+        "observations": {"calibrated": accuracy.CALIBRATED, "measured": accuracy.MEASURED},
+        "policies": {model.name: model.about() for model in trained},
+        "models": {},
+        "groups": {},
+    }
     for model in (*trained, *others):
         folders = accuracy.copies(model, args.work)
         found["models"][model.name] = accuracy.measure(model, folders, note)
@@ -89,25 +98,30 @@ def main() -> int:
     """Measures, or reports."""
     raw = argparse.RawDescriptionHelpFormatter
     parser = argparse.ArgumentParser(prog="python -m benches.int4", description=__doc__, formatter_class=raw)
-    parser.add_argument("what", choices=(*MEASUREMENTS, "report"))
-    parser.add_argument("checkpoint", nargs="?", type=Path, metavar="CHECKPOINT")
-    parser.add_argument("--work", type=Path, default=ROOT / "out" / "int4", help="recordings and checkpoints")
-    parser.add_argument("--small", action="store_true", help="errors: leave out the model of published width")
-    parser.add_argument(
-        "--policy", type=Path, action="append", default=[], metavar="DIR", help="also this one"
-    )
-    parser.add_argument("--episodes", type=int, default=300, help="loop: of a policy (default: 300)")
-    parser.add_argument("--jobs", type=int, default=2, help="loop: processes (default: 2)")
-    parser.add_argument("--num-threads", type=int, default=2)
-    parser.add_argument("--write", action="store_true", help="report: write the page")
+    words = parser.add_subparsers(dest="what", required=True)
+    of = {word: words.add_parser(word) for word in (*MEASUREMENTS, "report")}
+    of["report"].add_argument("--write", action="store_true", help="write the page")
+    for word in MEASUREMENTS:
+        work = ROOT / "out" / "int4"
+        of[word].add_argument("--work", type=Path, default=work, help="recordings and checkpoints")
+    for word in ("errors", "loop"):
+        of[word].add_argument("--policy", type=Path, action="append", default=[], metavar="DIR")
+    of["errors"].add_argument("--small", action="store_true", help="leave out the model of published width")
+    of["loop"].add_argument("--episodes", type=int, default=300, help="of a policy (default: 300)")
+    of["loop"].add_argument("--jobs", type=int, default=2, help="processes (default: 2)")
+    for word in ("full", "calibrate"):
+        of[word].add_argument("checkpoint", nargs="?", type=Path, metavar="CHECKPOINT")
+        of[word].add_argument("--num-threads", type=int, default=2)
     args = parser.parse_args()
     if args.what == "report":
-        return report(MEASURED, KEPT, PAGE, document, program="benches.int4", write=args.write)
+        status = report(MEASURED, KEPT, PAGE, document, program="benches.int4", write=args.write)
+        if args.write:
+            MEASURED.unlink(missing_ok=True)  # what is measured next is added to what is kept
+        return status
     args.work.mkdir(parents=True, exist_ok=True)
     MEASURED.parent.mkdir(exist_ok=True)
     measured = {"machine": describe()} | {"measured": MEASUREMENTS[args.what](args)}
-    before = next((path for path in (MEASURED, KEPT) if path.exists()), None)
-    found = json.loads(before.read_text()) if before else {}
+    found = json.loads((MEASURED if MEASURED.exists() else KEPT).read_text())
     write_json(MEASURED, found | {args.what: measured})
     return 0
 

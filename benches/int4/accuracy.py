@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -22,6 +23,7 @@ from saccade.datasets import open as open_recordings
 from saccade.evaluation.recordings import SpacedObservations, fitted
 from saccade.policy.reading import read_observations
 from saccade_lab import random_checkpoint
+from saccade_lab.files import checkpoint_identity
 from saccade_lab.sim.settings import CONFIG_FILE, SimulationConfig
 
 #: Observations that weights are rounded for, others that errors are measured on, and chunks of each of these.
@@ -61,9 +63,17 @@ class Trained(Model):
 
     Attributes:
         tasks: That it was trained on.
+        sha256: Of its weights.
+        settings: Of its training; None for the bundled policy, whose page tells them.
     """
 
     tasks: tuple[str, ...]
+    sha256: str
+    settings: Mapping[str, Any] | None
+
+    def about(self) -> dict[str, Any]:
+        """What tells it from others."""
+        return {"tasks": list(self.tasks), "sha256": self.sha256, "settings": self.settings}
 
 
 def random_models(work: Path, *, small: bool) -> list[Model]:
@@ -104,24 +114,33 @@ def trained(checkpoint: Path, work: Path) -> Trained:
     tasks = SimulationConfig.from_file(checkpoint / CONFIG_FILE).tasks
     bundled = checkpoint == saccade.demo_checkpoint()
     name = "the bundled policy" if bundled else f"a policy for {', '.join(tasks)}"
-    recordings = work / f"{checkpoint.name}-recordings"
+    sha256 = checkpoint_identity(checkpoint)["sha256"]
+    recordings = work / f"recordings-{sha256[:12]}"  # there when all episodes are
     if not recordings.is_dir():
         arguments = ["rollout", "--checkpoint", str(checkpoint), "--tasks", ",".join(tasks)]
         arguments += ["--episodes", str(EPISODES // len(tasks)), "--record", str(recordings)]
-        arguments += ["--out", str(work / f"{checkpoint.name}-rollout")]
+        arguments += ["--out", str(work / f"rollout-{sha256[:12]}")]
         subprocess.run([sys.executable, "-m", "saccade", *arguments], check=True)
     policy = Policy.from_pretrained(checkpoint)
     data = fitted(policy, open_recordings(recordings))
-    both = SpacedObservations(policy, data, 2 * (CALIBRATED + MEASURED))
+    both = SpacedObservations(policy, data, 3 * (CALIBRATED + MEASURED))
     held_out = [one for one, (episode, _) in zip(both, both.places, strict=True) if episode % 3 == 0]
     others = [one for one, (episode, _) in zip(both, both.places, strict=True) if episode % 3]
-    return Trained(
-        name,
-        checkpoint,
-        others[:: max(1, len(others) // CALIBRATED)],
-        held_out[:: max(1, len(held_out) // MEASURED)],
-        tasks,
-    )
+    settings = None if bundled else json.loads((checkpoint / "settings.json").read_text())
+    chosen = spaced(others, CALIBRATED), spaced(held_out, MEASURED)
+    return Trained(name, checkpoint, *chosen, tasks, sha256, settings)
+
+
+def spaced(observations: Sequence[Any], count: int) -> list[Any]:
+    """As many of them, evenly spaced.
+
+    Example:
+        >>> spaced(range(11), 3)
+        [0, 5, 10]
+    """
+    places = np.linspace(0, len(observations) - 1, count).round().astype(int)
+    assert len(set(places)) == count, f"{len(observations)} observations, expected at least {count}"
+    return [observations[place] for place in places]
 
 
 def results_of(policy: Policy, observations: Observations) -> tuple[Floats, Floats]:

@@ -27,7 +27,7 @@ def measure(model: Trained, folders: dict[str, Path], episodes: int, jobs: int, 
         jobs: Processes.
 
     Returns:
-        `tasks`, by name of the precision the success of each episode, in the same order.
+        What `Trained.about` says, and `success`: by name of the precision of each episode, in the same order.
     """
     arms: dict[str, tuple[Path, str]] = {name: (model.checkpoint, name) for name in ("float32", "int8")}
     arms |= {name: (folder, "int4") for name, folder in folders.items()}
@@ -41,7 +41,7 @@ def measure(model: Trained, folders: dict[str, Path], episodes: int, jobs: int, 
             parts = [next(found) for _ in tasks for _ in _parts(seeds)]
             of_arms[name] = [success for part in parts for success in part]
             note(f"{model.name}: {name} {sum(of_arms[name])} of {len(of_arms[name])}")
-    return {"tasks": list(tasks), "success": of_arms}
+    return {**model.about(), "success": of_arms}
 
 
 def _parts(seeds: range, size: int = 20) -> Iterable[range]:

@@ -10,7 +10,7 @@ import numpy as np
 from safetensors.numpy import save_file
 
 from benches.int4.accuracy import Model, Note, error, results_of
-from saccade.checkpoints import read_tensors
+from saccade.checkpoints import describe, read_tensors
 
 VISION = r".*(vision_model|visual)\..*"
 LANGUAGE = r".*language_model\..*"
@@ -47,7 +47,7 @@ def measure(model: Model, folders: dict[str, Path], work: Path, note: Note) -> d
     found: dict[str, dict[str, float]] = {}
     for kind, folder in folders.items():
         rounded = read_tensors(folder)
-        names = [name for name in exact if f"{name}_scale" in rounded]
+        names = [tensor.name for tensor in describe(folder).tensors if tensor.dtype == "U8"]
         for group, pattern in GROUPS.items():
             of_group = [name for name in names if re.fullmatch(pattern, name)]
             if not of_group:

@@ -14,9 +14,10 @@ RUNS = ("bfloat16", "int8", "int4", "int4, calibrated")
 ABOUT = """\
 Errors are differences from float32 on the same noise, as the root of the sum of squares relative to that of
 float32: of normalised actions, and of the backbone's features. Calibrated weights were rounded for other
-observations than those that errors are measured on, of the bundled policy in other episodes. Random models
+observations than those that errors are measured on, of trained policies in other episodes. Random models
 have planted outliers where trained ones have them (`saccade_lab.random_checkpoint`), and their images are
-random. "× int8" is the error of the actions over that of int8."""
+random. Weights are rounded for {calibrated} observations, and errors are those on {measured}. "× int8" is
+the error of the actions over that of int8."""
 
 ABOUT_GROUPS = """\
 Errors of actions if the weights of one group of layers are rounded to four bits, and all others and all
@@ -28,7 +29,7 @@ calibration used, an equal number of each task. Differences are in percentage po
 intervals; "no worse" means that the interval contains zero and excludes a loss of 5 points."""
 
 ABOUT_SIZE = """\
-A whole policy of N1.5's published size with random weights and one embodiment, loaded from what
+A whole policy of N1.5's published size with one embodiment, loaded from what
 `saccade quantize` wrote, each load in a process of its own with the page cache dropped: medians. Peak memory
 includes the interpreter and its libraries."""
 
@@ -37,14 +38,14 @@ The same policies, one observation at a time, by turns in one process: medians, 
 of one round with its quartiles. The first part is from images to the context of the head, the second a chunk
 from a held context."""
 
-NAME = "N1.5 at its published size, random weights"
+NAME = "N1.5 at its published size"
 SIZES = ("file, GB", "weights, GB", "peak at loading, GB", "peak with a call, GB", "loading, s", "reading, s")
 
 
 def document(record: Mapping[str, Any]) -> str:
     """Markdown of a record, which has what was measured and on what machine, by the word of the command."""
     parts = [
-        "# int4: errors, sensitive layers, closed loop, memory",
+        "# int4: errors, closed loop, memory and time",
         "Written by `python -m benches.int4 report --write` from `benches/int4/results.json`, which "
         "`python -m benches.int4` measured, with the word that each section names.",
     ]
@@ -62,8 +63,25 @@ def by(word: str, machine: Mapping[str, Any]) -> str:
 
 def errors_section(measured: Mapping[str, Any]) -> list[str]:
     """Errors by precision, and by group of layers."""
-    parts = ["## Errors by precision", ABOUT, errors(measured["models"])]
+    about = ABOUT.format_map(measured["observations"])
+    parts = ["## Errors by precision", about, *map(recipe, *zip(*measured["policies"].items(), strict=True))]
+    parts.append(errors(measured["models"]))
     return [*parts, "## One group of layers at a time", ABOUT_GROUPS, groups(measured["groups"])]
+
+
+def recipe(name: str, policy: Mapping[str, Any]) -> str:
+    """How a policy was trained, in words of the commands."""
+    weights = f"{name[0].upper()}{name[1:]}: weights {policy['sha256'][:16]}"
+    settings = policy["settings"]
+    if settings is None:
+        return f"{weights}."
+    episodes = ", ".join(
+        f"`saccade demos --tasks {task} --episodes {count}`"
+        for task, count in settings["demonstrations"]["tasks"].items()
+    )
+    flags = {"num_future_tokens": "num-future-tokens", "steps": "training-steps", "seed": "seed"}
+    train = " ".join(f"--{flag} {settings[name]}" for name, flag in flags.items())
+    return f"{weights}; {episodes}, then `saccade train {train}`."
 
 
 def loop_section(measured: Mapping[str, Any]) -> list[str]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import multiprocessing
+import shutil
 import time
 from pathlib import Path
 from typing import Any
@@ -59,6 +60,8 @@ def calibrate(checkpoint: Path, work: Path, threads: int, note: Note) -> dict[st
         memory in bytes.
     """
     one = with_one_embodiment(checkpoint, work)
+    # Layers that an interrupted run left would take no time.
+    shutil.rmtree(work / "calibrated-full.calibrating", ignore_errors=True)
     with multiprocessing.get_context("spawn").Pool(1) as pool:
         found: dict[str, Any] = pool.apply(_calibrate, (one, work / "calibrated-full", threads))
     note(f"calibration: {found}")

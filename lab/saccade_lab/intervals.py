@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import math
-from statistics import NormalDist
+import scipy  # scipy.stats is imported when it is used: it takes longer than most commands
 
 from saccade._internal.bootstrap import CONFIDENCE
 from saccade.errors import InputError
@@ -23,9 +22,5 @@ def wilson(successes: int, trials: int) -> tuple[float, float]:
         raise InputError(f"successes: given {successes} of {trials} trials, expected 0 to {trials}")
     if trials == 0:
         return 0.0, 1.0
-    z = NormalDist().inv_cdf((1 + CONFIDENCE) / 2)
-    rate = successes / trials
-    middle = 2 * trials * rate + z**2
-    half = z * math.sqrt(4 * trials * rate * (1 - rate) + z**2)
-    low, high = ((middle + side * half) / (2 * (trials + z**2)) for side in (-1, 1))
-    return (low if successes else 0.0), (high if successes < trials else 1.0)
+    interval = scipy.stats.binomtest(successes, trials).proportion_ci(CONFIDENCE, method="wilson")
+    return float(interval.low), float(interval.high)

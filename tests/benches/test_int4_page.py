@@ -22,6 +22,20 @@ def record() -> dict[str, Any]:
     half = {key: value / 2 for key, value in LOAD.items()}
     measured = {
         "errors": {
+            "observations": {"calibrated": 24, "measured": 12},
+            "policies": {
+                "the bundled policy": {"tasks": ["reach"], "sha256": 64 * "a", "settings": None},
+                "a policy for fork": {
+                    "tasks": ["fork"],
+                    "sha256": 64 * "b",
+                    "settings": {
+                        "num_future_tokens": 8,
+                        "steps": 5000,
+                        "seed": 1,
+                        "demonstrations": {"tasks": {"fork": 300}},
+                    },
+                },
+            },
             "models": {"a policy": RUNS},
             "groups": {"a policy": {"all": {"int4": 0.25, "int4, calibrated": 0.125}}},
         },
@@ -64,6 +78,12 @@ def test_the_page() -> None:
         assert line in lines
     text = " ".join(lines)
     assert text.count("a CPU (a family, avx2), 2 cores; commit abc") == 4
+    assert "rounded for 24 observations, and errors are those on 12." in text
+    assert "The bundled policy: weights aaaaaaaaaaaaaaaa." in text
+    assert (
+        "A policy for fork: weights bbbbbbbbbbbbbbbb; `saccade demos --tasks fork --episodes 300`, then "
+        "`saccade train --num-future-tokens 8 --training-steps 5000 --seed 1`."
+    ) in text
     assert "for 16 observations (400 weights): 1.5 minutes, and at most 7.0 GB" in text
 
 

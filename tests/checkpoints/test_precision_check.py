@@ -106,9 +106,15 @@ def test_a_reference_of_another_robot_is_refused(frames: Path, tmp_path: Path) -
     source = whole("isaac")
     other = Path(shutil.copytree(source, tmp_path / "other"))
     path = other / "experiment_cfg" / "metadata.json"
-    path.write_text(path.read_text().replace('"arm"', '"leg"'))
-    with pytest.raises(InputError, match="reference: expected one whose actions are those of source"):
-        check_precisions(source, frames, reference=other, instruction="open it", embodiment=EMBODIMENT)
+    metadata = json.loads(path.read_text())
+    statistics = metadata[EMBODIMENT]["statistics"]["action"]["arm"]
+    statistics["max"] = statistics["min"]
+    path.write_text(json.dumps(metadata))
+    options: dict[str, Any] = {"instruction": "open it", "embodiment": EMBODIMENT}
+    with pytest.raises(InputError, match=r"in its weights alone, got another second, moving of arm"):
+        check_precisions(source, frames, reference=other, **options)
+    with pytest.raises(InputError, match="in its weights alone, got another"):
+        check_precisions(source, frames, reference=whole("n16"), **options)
 
 
 def test_ranges_are_those_of_the_statistics() -> None:

@@ -105,6 +105,35 @@ def test_quantize_to_int4(layout: str, tmp_path: Path) -> None:
     assert same(act(out, "int4"), act(source, "int4"))
 
 
+def test_int4_with_embeddings_as_they_were_has_the_same_bits(tmp_path: Path) -> None:
+    """The first checkpoints in int4 had them so."""
+    source, out = whole("isaac"), tmp_path / "int4"
+    quantize(source, out, to="int4")
+    tensors = layouts.read(out, "")
+    (table,) = (name for name in tensors if name.endswith("embed_tokens.weight"))
+    del tensors[f"{table}_scale"]
+    tensors[table] = layouts.read(source, "")[table]
+    save_file(tensors, out / "model.safetensors")
+    assert same(act(out, "int4"), act(source, "int4"))
+
+
+def test_a_checkpoint_of_which_only_embeddings_are_int8(tmp_path: Path) -> None:
+    """One that other programs may write: it is loaded, and not quantised again."""
+    source, out, mixed = whole("isaac"), tmp_path / "int4", tmp_path / "mixed"
+    quantize(source, out, to="int4")
+    stored, tensors = layouts.read(out, ""), layouts.read(source, "")
+    (table,) = (name for name in tensors if name.endswith("embed_tokens.weight"))
+    tensors |= {name: stored[name] for name in (table, f"{table}_scale")}
+    shutil.copytree(source, mixed)
+    for path in mixed.glob("*.safetensors*"):
+        path.unlink()
+    save_file(tensors, mixed / "model.safetensors")
+    assert same(act(mixed, "int8"), act(source, "int8"))
+    for to in ("int8", "int4"):
+        with pytest.raises(CheckpointError, match=r"quantised already: .*embed_tokens"):
+            quantize(mixed, tmp_path / "again", to=to)
+
+
 @pytest.mark.parametrize("precision", ["float32", "bfloat16"])
 def test_embeddings_in_int8_are_what_the_integers_represent(precision: str, tmp_path: Path) -> None:
     source, out = whole("isaac"), tmp_path / "int4"

@@ -195,7 +195,7 @@ fn what_is_wrong_is_named() {
     round(std::slice::from_ref(&other), &gram, &stray).unwrap();
     assert_eq!(
         call(Precision::Int4, &[&stray]),
-        format!("rounded: expected weights that are quantised, got {other}")
+        format!("rounded: expected weights that become int4, got {other}")
     );
     std::fs::remove_dir_all(folder).unwrap();
 }

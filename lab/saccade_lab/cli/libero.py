@@ -230,7 +230,7 @@ def prepare(args: argparse.Namespace, workers: Workers) -> Session:
             for name, path in found.items()
         },
         "noise": vars(noise),
-        **software(),
+        **software(options["precision"]),
     }
     results = Results.begin(args.out, settings)
     items = [

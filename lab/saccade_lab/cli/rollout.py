@@ -259,7 +259,9 @@ def show(session: Session) -> None:
         print("no episode was completed")
         return
     engine = session.policy.describe()
-    said = {key: " ".join(value) if isinstance(value, list) else value for key, value in engine.items()}
+    said = {
+        key: " ".join(value) or "none" if isinstance(value, list) else value for key, value in engine.items()
+    }
     described = ", ".join(f"{key} {value}" for key, value in said.items() if key != "name")
     table = make_table(f"{engine['name']} engine ({described})")
     for summary in summarize_tasks(episodes):

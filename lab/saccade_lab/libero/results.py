@@ -33,7 +33,6 @@ SETTINGS = (
     "option_files",
     "noise",
     "saccade",
-    "library",
     "instruction_set",
     "dot_products",
     "packages",
@@ -111,7 +110,9 @@ class Results:
             repeated = [key for key, count in Counter(one.key for one in episodes).items() if count > 1]
             if repeated:
                 raise ValueError(f"{' '.join(map(str, repeated[0]))} is there twice")
-            earlier = {name: record[name] for name in SETTINGS}
+            # The first records had no dot products.
+            earlier = {name: record[name] for name in SETTINGS if name != "dot_products"}
+            earlier["dot_products"] = record.get("dot_products")
             different = _different(earlier, json.loads(json.dumps(settings)))
         except (KeyError, TypeError, ValueError, AttributeError) as error:
             raise InputError(
@@ -270,9 +271,21 @@ def _decisive(protocol: Mapping[str, Any]) -> dict[str, Any]:
     return {**{name: value for name, value in protocol.items() if name not in reasons}, "gripper": rule}
 
 
-def software() -> dict[str, Any]:
-    """The settings that say what computes: ``arithmetic`` of saccade, and the versions of packages."""
-    return {**arithmetic(), "packages": {name: _version(name) for name in PACKAGES}}
+def software(precision: Mapping[str, str]) -> dict[str, Any]:
+    """The settings that say what computes: saccade's version and instructions, and the versions of packages.
+
+    Builds are not compared, as ``saccade_lab.parallel.cluster`` does not: each machine may have its own.
+
+    Args:
+        precision: Those of backbone and head. float32 uses no dot products: those of the CPU do not matter.
+    """
+    found = arithmetic()
+    return {
+        "saccade": found["saccade"],
+        "instruction_set": found["instruction_set"],
+        "dot_products": [] if set(precision.values()) == {"float32"} else found["dot_products"],
+        "packages": {name: _version(name) for name in PACKAGES},
+    }
 
 
 def _version(name: str) -> str | None:

@@ -114,12 +114,13 @@ class Maps:
         """
         if self.occlusion is None:
             return None
-        ranks, cameras = scipy.stats.rankdata, self.view.layout.cameras
+        cameras = self.view.layout.cameras
         read = np.concatenate([keys[camera.positions] for camera in cameras])
         change = np.concatenate([self.occlusion.change[camera.name].ravel() for camera in cameras])
         if np.ptp(read) == 0 or np.ptp(change) == 0:
             return None
-        return float(np.corrcoef(ranks(read), ranks(change))[0, 1])
+        ranks = [scipy.stats.rankdata(values) for values in (read, change)]
+        return float(np.corrcoef(ranks)[0, 1])
 
     def agreements(self) -> list[dict[str, Any]]:
         """``agreement`` of each group's mean map over heads and Euler steps, in cross-attention blocks."""

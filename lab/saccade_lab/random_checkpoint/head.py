@@ -27,13 +27,14 @@ def config_of_size(size: str) -> dict[str, Any]:
     return sized_config(size, num_embodiments=1)
 
 
-def write_head(folder: Path, config: Mapping[str, Any], *, seed: int = 0) -> None:
-    """Writes ``config.json`` and ``model.safetensors``, in bfloat16: 1.5 GB at N1.5's size.
+def write_head(folder: Path, config: Mapping[str, Any], *, seed: int = 0, dtype: str = "BF16") -> None:
+    """Writes ``config.json`` and ``model.safetensors``: in bfloat16 1.5 GB at N1.5's size.
 
     Args:
         folder: An existing directory.
         config: Config of the head in the released keys.
         seed: Seed of all tensors.
+        dtype: ``"BF16"`` or ``"F32"``.
 
     Raises:
         CheckpointError: The config is not one of a head.
@@ -41,6 +42,6 @@ def write_head(folder: Path, config: Mapping[str, Any], *, seed: int = 0) -> Non
     """
     whole = whole_config(config)
     shapes = _saccade.tensor_shapes(json.dumps(whole))
-    tensors = [Tensor(f"action_head.{name}", tuple(shape), "BF16") for name, shape in shapes]
+    tensors = [Tensor(f"action_head.{name}", tuple(shape), dtype) for name, shape in shapes]
     write_json(folder / "config.json", whole)
     write_file(folder / "model.safetensors", tensors, seed)

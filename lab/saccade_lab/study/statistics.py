@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Literal, TypeAlias
 
 import numpy as np
-import scipy  # its parts are imported when they are used, which takes longer than most commands
+import scipy  # its parts are imported when they are used: that takes longer than most commands
 
 from saccade._internal.bootstrap import CONFIDENCE as CONFIDENCE
 from saccade._internal.bootstrap import Estimate as Estimate

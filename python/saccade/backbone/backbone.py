@@ -65,8 +65,8 @@ class Backbone(Loaded[_saccade.Backbone, BackboneConfig]):
                 directory of the weights, if there is one.
             precision: ``"float32"``, ``"bfloat16"``, ``"int8"`` or ``"int4"``, as for
                 :meth:`saccade.ActionHead.from_pretrained`. The token embeddings are kept in bfloat16, in
-                float32 if they are stored so and the precision is float32, and with ``"int8"`` and ``"int4"``
-                in int8 with a scale for each row.
+                float32 if they are not stored in bfloat16 and the precision is float32, and with ``"int8"``
+                and ``"int4"`` in int8 with a scale for each row.
 
         Raises:
             FileNotFoundError, PermissionError, CheckpointError, InputError: As

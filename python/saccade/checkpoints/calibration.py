@@ -17,6 +17,7 @@ import numpy.typing as npt
 import saccade._saccade as _saccade
 from saccade._internal import run_settings
 from saccade._internal.arrays import Float32Array, integer
+from saccade._internal.environment import library
 from saccade.backbone.backbone import Backbone
 from saccade.errors import CheckpointError, InputError
 from saccade.head.head import ActionHead
@@ -134,6 +135,7 @@ def round_layers(given: Calibration, rewrite: Mapping[str, Any], folder: Path) -
         "action_horizon": head.config.action_horizon,
         "parts": [part for part, prefix in prefixes.items() if prefix is not None],
         "saccade": _saccade.__version__,
+        "library": library(),
         "instruction_set": head.isa,
     }
     _begin(folder, settings)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -34,8 +35,7 @@ PRECISIONS: Mapping[str, Mapping[str, str]] = MappingProxyType(
 
 #: Largest difference of an action, relative to its range, at which a precision is recommended: a convention.
 #: int8 stays below it in the small policies that were tested, and 300 paired episodes of a sensitive task
-#: excluded that int8 costs 2 points of success (docs/precision.md). int4, which is above it, cost up to 2
-#: points of 300 episodes (docs/results/int4.md).
+#: excluded that int8 costs 2 points of success (docs/precision.md).
 TOLERANCE = 0.01
 
 #: Number of chunks that are compared for each observation, from different noise.
@@ -144,12 +144,13 @@ def check_precisions(
     Raises:
         FileNotFoundError, CheckpointError, InputError, ShapeError, DtypeError: As
             :meth:`saccade.Policy.from_pretrained` and :func:`saccade.observations.pictures.read_frames`.
-        InputError: The actions of ``reference`` have other keys or sizes than those of ``source``.
+        InputError: ``reference`` has another head, other actions or statistics than ``source``, or its
+            features have another shape.
 
     Example:
         >>> from pathlib import Path
         >>> from saccade.checkpoints import check_precisions
-        >>> def best(checkpoint: str) -> str:
+        >>> def best(checkpoint: str) -> str | None:
         ...     return check_precisions(checkpoint, Path("frames"), instruction="open the drawer").recommended
     """
     seed = integer("seed", seed, least=0)
@@ -167,6 +168,16 @@ def check_precisions(
             num_threads=num_threads,
         )
 
+    todo = len(PRECISIONS) + (reference is not None)
+    done = 0
+
+    def step() -> None:
+        nonlocal done
+        if progress is not None:
+            progress(done, todo)
+        done += 1
+
+    step()
     first, first_precision = next(iter(PRECISIONS.items()))
     policy = load(source if reference is None else reference, first_precision)
     groups = policy.normalizer.action_groups
@@ -175,14 +186,14 @@ def check_precisions(
     others = run(policy, recorded, seed + len(recorded))
     other_noise = difference(exact.actions, others.actions, groups)
     found: list[PrecisionError] = []
-    for index, (name, precision) in enumerate(PRECISIONS.items()):
-        if progress is not None:
-            progress(index, len(PRECISIONS))
+    for name, precision in PRECISIONS.items():
         results = exact
         if reference is not None or name != first:
-            del policy  # before the next one is loaded
-            policy = load(source, precision)
-            _check_actions(groups, policy.normalizer.action_groups)
+            step()
+            exact_policy, policy = policy, load(source, precision)
+            if not found:
+                _check_alike(exact_policy, policy)
+            del exact_policy
             results = run(policy, recorded, seed)
         found.append(
             PrecisionError(
@@ -203,15 +214,37 @@ def check_precisions(
         tolerance=TOLERANCE,
         recommended=recommended(found),
         reference=None if reference is None else os.fspath(reference),
-        is_quantized=any(tensor.dtype in ("I8", "U8") for tensor in describe(source).tensors),
+        is_quantized=_is_quantized(source),
     )
 
 
-def _check_actions(expected: Sequence[Group], found: Sequence[Group]) -> None:
-    """Checks that two checkpoints control the same robot."""
-    sizes, others = ({group.key: group.size for group in groups} for groups in (expected, found))
-    if sizes != others:
-        raise InputError(f"reference: expected one whose actions are those of source, {others}, got {sizes}")
+def _is_quantized(source: str | os.PathLike[str]) -> bool:
+    """Whether some weights are int8 or int4, with scales beside them."""
+    tensors = describe(source).tensors
+    names = {tensor.name for tensor in tensors}
+    return any(tensor.dtype in ("I8", "U8") and f"{tensor.name}_scale" in names for tensor in tensors)
+
+
+def _check_alike(reference: Policy, source: Policy) -> None:
+    """Checks that actions of two policies can be compared, number by number and in the same range."""
+    expected = "reference: expected one that differs from source in its weights alone"
+    configs = [dataclasses.asdict(policy.head.config) for policy in (reference, source)]
+    if other := [name for name, value in configs[1].items() if configs[0][name] != value]:
+        raise InputError(f"{expected}, got another {', '.join(other)}")
+    groups = [[_values(group) for group in one.normalizer.action_groups] for one in (reference, source)]
+    if [group["key"] for group in groups[0]] != [group["key"] for group in groups[1]]:
+        raise InputError(f"{expected}, got actions {', '.join(group['key'] for group in groups[0])}")
+    for theirs, ours in zip(*groups, strict=True):
+        if other := [name for name, value in ours.items() if theirs[name] != value]:
+            raise InputError(f"{expected}, got another {', '.join(other)} of {ours['key']}")
+
+
+def _values(group: Group) -> dict[str, Any]:
+    """The fields of a group, which can be compared."""
+    return {
+        name: value.tolist() if isinstance(value, np.ndarray) else value
+        for name, value in vars(group).items()
+    }
 
 
 def recommended(found: Sequence[PrecisionError]) -> str | None:
@@ -239,6 +272,10 @@ def features_error(exact: Sequence[Float32Array], given: Sequence[Float32Array])
     """The mean over tokens of the norm of the difference, relative to the token's norm."""
     rows = []
     for expected, got in zip(exact, given, strict=True):
+        if got.shape != expected.shape:
+            raise InputError(
+                f"reference: expected one that gives source's features {got.shape}, got {expected.shape}"
+            )
         norms = np.linalg.norm(expected.astype(np.float64), axis=-1)
         differences = np.linalg.norm(got.astype(np.float64) - expected, axis=-1)
         rows.append(differences / np.maximum(norms, np.finfo(np.float64).tiny))

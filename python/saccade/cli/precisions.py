@@ -76,12 +76,14 @@ def overview(found: PrecisionCheck) -> Section:
 
 def by_key(found: PrecisionCheck) -> Section:
     """The largest differences in the robot's units, a row for each key of the action."""
-    differences = [*(one.actions for one in found.precisions[1:]), found.other_noise]
+    # float32 differs from itself by nothing.
+    compared = found.precisions[1:] if found.reference is None else found.precisions
+    differences = [*(one.actions for one in compared), found.other_noise]
     rows = [
         [key, *(f"{one.largest[key]:.2e} ({one.of_range[key]:.2%})" for one in differences)]
         for key in found.other_noise.largest
     ]
-    names = [*(one.name for one in found.precisions[1:]), "float32, other noise"]
+    names = [*(one.name for one in compared), "float32, other noise"]
     return Section(
         "Largest difference of an action in the robot's units (of its range)",
         ["", *(f">{name}" for name in names)],

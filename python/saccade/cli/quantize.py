@@ -103,10 +103,12 @@ def run(args: argparse.Namespace) -> int:
                 progress=lambda done, total: update(done // 10**6, total // 10**6, "writing, MB"),
                 **chosen,
             )
-    with_table = args.to == "int4" and report.num_quantized_backbone
-    stored = "int4, of which the token embeddings are in int8" if with_table else args.to
+    # With int4 one of a backbone's is the token embeddings.
+    has_table = args.to == "int4" and report.num_quantized_backbone > 0
+    table = " and the token embeddings in int8" if has_table else ""
     lines = [
-        f"{args.out}: {report.num_quantized} weights in {stored}, {report.num_copied} tensors copied, "
+        f"{args.out}: {report.num_quantized - has_table} weights in {args.to}{table}, "
+        f"{report.num_copied} tensors copied, "
         f"{report.num_dropped} left out; the head has {report.head_bytes_after / 1e6:.1f} MB "
         f"(was {report.head_bytes_before / 1e6:.1f} MB)"
     ]

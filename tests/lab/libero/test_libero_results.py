@@ -40,7 +40,6 @@ SETTINGS: dict[str, Any] = {
     "option_files": {"tokenizer": {"name": "words.json", "sha256": "2" * 64}},
     "noise": {"seed": 0, "is_common": False},
     "saccade": "1.0",
-    "library": "0" * 12,
     "instruction_set": "avx2",
     "dot_products": ["int8"],
     "packages": {"numpy": "2.0", "mujoco": "3.3.0"},
@@ -164,7 +163,6 @@ def changed(path: tuple[str, ...], value: Any) -> dict[str, Any]:
         (("option_files",), {}, "options.tokenizer"),
         (("noise", "seed"), 1, "noise"),
         (("saccade",), "1.1", "saccade"),
-        (("library",), "1" * 12, "library"),
         (("instruction_set",), "avx512", "instruction_set"),
         (("dot_products",), [], "dot_products"),
         (("packages", "mujoco"), "3.3.1", "packages.mujoco"),
@@ -178,6 +176,16 @@ def test_episodes_of_another_run_are_refused_by_name(
         Results.begin(tmp_path, changed(path, value))
 
 
+def test_records_of_before_dot_products_are_of_another_run(tmp_path: Path) -> None:
+    filled().write(tmp_path, ABOUT)
+    path = tmp_path / "results.json"
+    record = json.loads(path.read_text())
+    del record["dot_products"]
+    path.write_text(json.dumps(record))
+    with pytest.raises(InputError, match=r"another run: other dot_products\. Choose"):
+        Results.begin(tmp_path, filled().settings)
+
+
 def test_names_do_not_matter_where_contents_are_equal(tmp_path: Path) -> None:
     filled().write(tmp_path, ABOUT)
     other = changed(("checkpoint", "name"), "renamed")
@@ -187,12 +195,12 @@ def test_names_do_not_matter_where_contents_are_equal(tmp_path: Path) -> None:
 
 
 def test_software_is_what_runs_here() -> None:
-    found = software()
+    found = software({"backbone": "int8", "head": "float32"})
     assert found["saccade"] == saccade.__version__
     config = saccade.show_config("dicts")
-    assert found["library"] == config["library"]
     assert found["instruction_set"] == config["isa"]
     assert found["dot_products"] == config["dot_products"]
+    assert software({"backbone": "float32", "head": "float32"}) == {**found, "dot_products": []}
     assert found["packages"]["numpy"] == np.__version__
     assert set(found) < set(SETTINGS)
 

@@ -9,7 +9,7 @@ use saccade_vla_checkpoint::{Elements, TensorSpec};
 use saccade_vla_kernels::{Matrix, PackedLinear, WeightRef, quantize_rows};
 
 use super::source::{Outline, Request, Source, Stored, Tensor, Weight, weight_view};
-use crate::alloc::{filled, product};
+use crate::alloc::{collected, filled, product};
 use crate::array::{OwnedArray, first_not_finite, first_where, unravel};
 use crate::engine::Engine;
 use crate::error::{Error, Result, problem, show_shape};
@@ -115,8 +115,16 @@ impl Weights<'_> {
         let table = match table {
             Tensor::Held(elements @ Elements::Int8 { .. }) if is_int8 => Tensor::Held(elements),
             Tensor::Held(elements) if is_int8 => quantized(&elements, shape)?,
+            Tensor::Held(Elements::Int8 { values, scales }) if self.engine().precision.rounds_weights() => {
+                let rows = values.chunks_exact(width.max(1)).zip(&scales);
+                let rounded = rows.flat_map(|(row, &scale)| {
+                    row.iter()
+                        .map(move |&value| bf16::from_f32(f32::from(value) * scale))
+                });
+                Tensor::Held(Elements::Bf16(collected("weights", values.len(), rounded)?))
+            }
             Tensor::Held(elements @ Elements::Int8 { .. }) => {
-                Tensor::Held(Elements::F32(elements.into_f32()?)).rounded(self.engine())?
+                Tensor::Held(Elements::F32(elements.into_f32()?))
             }
             table => table.rounded(self.engine())?,
         };

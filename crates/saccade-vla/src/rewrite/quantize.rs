@@ -3,7 +3,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 
-use saccade_vla_checkpoint::spec::WEIGHT;
+use saccade_vla_checkpoint::spec::{TABLE, WEIGHT};
 use saccade_vla_checkpoint::{Checkpoint, CheckpointWriter, Dtype, PlannedTensor, TensorSpec};
 use saccade_vla_kernels::quantize_rows;
 
@@ -94,7 +94,7 @@ pub fn quantize(
         .names()
         .find(|&name| weights.stored_as(name) != Some(Dtype::U8))
     {
-        bail!(Input, "rounded"; expected "weights that are quantised"; got "{name}");
+        bail!(Input, "rounded"; expected "weights that become int4"; got "{name}");
     }
     let backbone_prefix = weights.backbone_prefix;
     let mut planned = Vec::new();
@@ -192,9 +192,9 @@ impl Quantizing {
             weights.add(backbone.prefix(), backbone.specs(), to);
             weights.backbone_prefix = Some(backbone.prefix());
         }
-        for (name, dtype) in &weights.all {
+        for name in &weights.may_be_quantized {
             // What the source has none of is found where the tensors are listed.
-            if dtype.is_some() && source.checkpoint.dtype(name).is_ok() {
+            if source.checkpoint.dtype(name).is_ok() {
                 check_not_quantized(&source.checkpoint, name)?;
             }
         }
@@ -211,6 +211,8 @@ impl Quantizing {
 struct Names {
     /// With the type that [`quantize`] stores each as; none of those that are copied.
     all: BTreeMap<String, Option<Dtype>>,
+    /// Those that may be stored as whole numbers, whatever `quantize` stores them as.
+    may_be_quantized: BTreeSet<String>,
     /// What the names of a backbone's begin with, if there is one that is quantised.
     backbone_prefix: Option<&'static str>,
 }
@@ -218,12 +220,17 @@ struct Names {
 impl Names {
     fn add(&mut self, prefix: &str, specs: &[TensorSpec], to: Precision) {
         for spec in specs {
-            let dtype = match to {
-                Precision::Int4 => spec.quantized_types.last().copied(),
+            let name = format!("{prefix}{}", spec.name);
+            let dtype = match (to, spec.quantized_types) {
+                (Precision::Int4, WEIGHT) => Some(Dtype::U8),
+                (Precision::Int4, TABLE) | (_, WEIGHT) => Some(Dtype::I8),
                 // Tables stay as they are, although a model in int8 holds them as int8.
-                _ => (spec.quantized_types == WEIGHT).then_some(Dtype::I8),
+                _ => None,
             };
-            self.all.insert(format!("{prefix}{}", spec.name), dtype);
+            if !spec.quantized_types.is_empty() {
+                self.may_be_quantized.insert(name.clone());
+            }
+            self.all.insert(name, dtype);
         }
     }
 
@@ -298,7 +305,9 @@ fn sizes_of(source: &SourceCheckpoint, name: &str) -> [usize; 2] {
 /// Copies a tensor of the head bit for bit, if all its numbers are finite.
 fn copy_finite(checkpoint: &Checkpoint, name: &str, writer: &mut CheckpointWriter) -> Result<()> {
     let Some(float) = Float::of(checkpoint.dtype(name)?) else {
-        unreachable!("a head's tensors are checked to be floating point")
+        unreachable!(
+            "tensors that may be stored as integers are checked not to be, and others are floating point"
+        )
     };
     let mut values = Vec::new();
     checkpoint.read_bytes(name, |bytes| {
