@@ -99,7 +99,8 @@ def calibration_section(measured: Mapping[str, Any]) -> list[str]:
     """How long calibration takes."""
     words = (
         f"`saccade quantize --calibrate` of the same policy, for {measured['observations']} observations "
-        f"({measured['weights']} weights): {measured['seconds'] / 60:.1f} minutes, and at most "
+        f"({measured['weights']} weights): {measured['seconds'] / 60:.1f} minutes "
+        "(the machine was in use: less on an idle one), and at most "
         f"{measured['peak'] / 1e9:.1f} GB of memory."
     )
     parts = ["## Calibration", words]

@@ -165,10 +165,10 @@ def quantize(
         head_only: Whether to leave out tensors outside the head.
         keep_backbone: Whether to copy the tensors of a backbone bit for bit.
         calibration: Observations for which int4 weights are rounded. All of them are run in float32, once for
-            each GiB of the layers' Gram matrices (9 for N1.5), whose time was not measured. In memory are the
-            policy, one such GiB, the factor of the largest matrix in float64 (half a GiB for 8192 inputs) and
-            the features of all observations. Finished layers are kept in ``OUT.calibrating`` until the copy
-            is written, and a call that was interrupted goes on with them.
+            each GiB of the layers' Gram matrices (9 for N1.5, in 20 minutes for 16 observations). In memory
+            are the policy, one such GiB, the factor of the largest matrix in float64 (half a GiB for 8192
+            inputs) and the features of all observations. Finished layers are kept in ``OUT.calibrating``
+            until the copy is written, and a call that was interrupted goes on with them.
         force: Whether to replace an existing checkpoint. A directory that contains other files is never
             replaced.
         progress: Called after each tensor with the number of bytes that are done and the total number of
