@@ -63,6 +63,10 @@ def equal(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return copy_of_the_demo(tmp_path_factory.mktemp("equal"), changed)
 
 
+#: As it is where a test replaces it.
+GRADIENT_SHARE = measures.gradient_share
+
+
 @pytest.fixture
 def known_shares(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of the episodes 0 to 4; computing them takes two seconds each."""
@@ -144,6 +148,8 @@ def test_a_single_row_is_its_own_mean(tmp_path: Path, known_shares: None) -> Non
     assert {row["block"] for row in rows if row["group"] == "state"} == set(range(4))
     (cheap,) = measures.measure(str(one), TASKS, range(5))
     assert cheap["probe_r2"] is None
+    share = GRADIENT_SHARE(Simulator(str(one), TASKS, range(1)), TASKS[0], 0)
+    assert abs(share) < 1
 
 
 def test_attention_mass_is_that_of_the_trace() -> None:
