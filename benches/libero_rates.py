@@ -46,7 +46,7 @@ def record_of(runs: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """
     first = runs[0]
     for run in runs:
-        differing = [name for name in COMMON if run.get(name) != first.get(name)]
+        differing = [name for name in COMMON if run[name] != first[name]]
         if differing:
             raise SystemExit(f"benches.libero_rates: runs that differ in {', '.join(differing)}")
     suites: dict[str, Any] = {}
@@ -62,7 +62,7 @@ def record_of(runs: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     for name, suite in suites.items():
         for task, counts in suite["tasks"].items():
             counts["instruction"] = words[name, task]
-    return {name: first.get(name) for name in COMMON} | {"suites": suites}
+    return {name: first[name] for name in COMMON} | {"suites": suites}
 
 
 def table(record: Mapping[str, Any]) -> str:

@@ -2,13 +2,13 @@
 
     python -m benches.int4 errors [--small] [--policy DIR]  of actions, by precision and by group of layers
     python -m benches.int4 loop [--policy DIR]              success in closed loop on the same episodes
-    python -m benches.int4 full [CHECKPOINT]                memory, loading and time at N1.5's published size
-    python -m benches.int4 calibrate [CHECKPOINT]           how long its calibration takes, and its errors
+    python -m benches.int4 full                             memory, loading and time at N1.5's published size
+    python -m benches.int4 calibrate                        how long its calibration takes, and its errors
     python -m benches.int4 report [--write]                 prints the page, or writes docs/results/int4.md
 
-Each adds to out/int4.json what it measured; the report has the committed measurements for the rest. Needs the
-lab with its simulator: trained policies are recorded in their tasks first. A policy is one that `saccade
-train` wrote; the bundled one is measured without being named. Without a CHECKPOINT a random one is written.
+Each adds to out/int4.json what it measured; the report has the committed measurements for the rest, and
+removes that file once it is written. Needs the lab with its simulator: trained policies are recorded in their
+tasks first. A policy is one that `saccade train` wrote; the bundled one is measured without being named.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 import saccade
-from benches.checkpoints import n15
+from benches.checkpoints import written
 from benches.int4 import accuracy, closed_loop, groups, size, time
 from benches.int4.page import document
 from benches.pages.report import report
@@ -79,14 +79,14 @@ def loop(args: argparse.Namespace) -> dict[str, Any]:
 
 def full(args: argparse.Namespace) -> dict[str, Any]:
     """Memory, loading and time at published size."""
-    checkpoint = n15(args.work, small=False, given=args.checkpoint)
+    checkpoint = written(args.work / "n15-outliers", outliers=True)
     sizes = size.measure(checkpoint, args.work, args.num_threads, note)
     return {"size": sizes, "time": time.measure(args.work, args.num_threads, note)}
 
 
 def calibrate(args: argparse.Namespace) -> dict[str, Any]:
     """How long calibration takes at published size, and the errors of actions."""
-    checkpoint = n15(args.work, small=False, given=args.checkpoint)
+    checkpoint = written(args.work / "n15-outliers", outliers=True)
     found = size.calibrate(checkpoint, args.work, args.num_threads, note)
     return found | {"errors": accuracy.measure(*size.calibrated(args.work), note)}
 
@@ -110,20 +110,28 @@ def main() -> int:
     of["loop"].add_argument("--episodes", type=int, default=300, help="of a policy (default: 300)")
     of["loop"].add_argument("--jobs", type=int, default=2, help="processes (default: 2)")
     for word in ("full", "calibrate"):
-        of[word].add_argument("checkpoint", nargs="?", type=Path, metavar="CHECKPOINT")
         of[word].add_argument("--num-threads", type=int, default=2)
     args = parser.parse_args()
     if args.what == "report":
-        status = report(MEASURED, KEPT, PAGE, document, program="benches.int4", write=args.write)
+        status = report(merged(), KEPT, PAGE, document, program="benches.int4", write=args.write)
         if args.write:
-            MEASURED.unlink(missing_ok=True)  # what is measured next is added to what is kept
+            MEASURED.unlink(missing_ok=True)
         return status
+    before = json.loads(MEASURED.read_text()) if MEASURED.exists() else {}
     args.work.mkdir(parents=True, exist_ok=True)
     MEASURED.parent.mkdir(exist_ok=True)
     measured = {"machine": describe()} | {"measured": MEASUREMENTS[args.what](args)}
-    found = json.loads((MEASURED if MEASURED.exists() else KEPT).read_text())
-    write_json(MEASURED, found | {args.what: measured})
+    write_json(MEASURED, before | {args.what: measured})
     return 0
+
+
+def merged() -> Path:
+    """A file with what was measured since, and the committed measurements of the rest."""
+    if not MEASURED.exists():
+        return KEPT
+    path = MEASURED.with_name("int4-report.json")
+    write_json(path, json.loads(KEPT.read_text()) | json.loads(MEASURED.read_text()))
+    return path
 
 
 if __name__ == "__main__":

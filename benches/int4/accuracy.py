@@ -63,7 +63,7 @@ class Trained(Model):
 
     Attributes:
         tasks: That it was trained on.
-        sha256: Of its weights.
+        sha256: Of its files, see `saccade_lab.files.checkpoint_identity`.
         settings: Of its training; None for the bundled policy, whose page tells them.
     """
 
@@ -139,7 +139,10 @@ def spaced(observations: Sequence[Any], count: int) -> list[Any]:
         [0, 5, 10]
     """
     places = np.linspace(0, len(observations) - 1, count).round().astype(int)
-    assert len(set(places)) == count, f"{len(observations)} observations, expected at least {count}"
+    if len(set(places)) < count:
+        raise SystemExit(
+            f"benches.int4: {len(observations)} recorded observations, expected at least {count}"
+        )
     return [observations[place] for place in places]
 
 

@@ -6,8 +6,10 @@ import statistics
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+from benches.int4.size import MEASURED
 from saccade_lab.study.statistics import paired_difference, scaled, verdict
 from saccade_lab.timing import quartiles
+from saccade_lab.training.settings import TrainingSettings
 
 RUNS = ("bfloat16", "int8", "int4", "int4, calibrated")
 
@@ -29,16 +31,16 @@ calibration used, an equal number of each task. Differences are in percentage po
 intervals; "no worse" means that the interval contains zero and excludes a loss of 5 points."""
 
 ABOUT_SIZE = """\
-A whole policy of N1.5's published size with one embodiment, loaded from what
-`saccade quantize` wrote, each load in a process of its own with the page cache dropped: medians. Peak memory
-includes the interpreter and its libraries."""
+A whole policy of N1.5's published size with random weights, planted outliers and one embodiment, loaded from
+what `saccade quantize` wrote, each load in a process of its own with the page cache dropped: medians. Peak
+memory includes the interpreter and its libraries."""
 
 ABOUT_TIME = """\
 The same policies, one observation at a time, by turns in one process: medians, and the median of the ratios
 of one round with its quartiles. The first part is from images to the context of the head, the second a chunk
 from a held context."""
 
-NAME = "N1.5 at its published size"
+NAME = "outliers, N1.5 at its published size"
 SIZES = ("file, GB", "weights, GB", "peak at loading, GB", "peak with a call, GB", "loading, s", "reading, s")
 
 
@@ -71,7 +73,7 @@ def errors_section(measured: Mapping[str, Any]) -> list[str]:
 
 def recipe(name: str, policy: Mapping[str, Any]) -> str:
     """How a policy was trained, in words of the commands."""
-    weights = f"{name[0].upper()}{name[1:]}: weights {policy['sha256'][:16]}"
+    weights = f"{name[0].upper()}{name[1:]}: checkpoint {policy['sha256'][:16]}"
     settings = policy["settings"]
     if settings is None:
         return f"{weights}."
@@ -79,9 +81,11 @@ def recipe(name: str, policy: Mapping[str, Any]) -> str:
         f"`saccade demos --tasks {task} --episodes {count}`"
         for task, count in settings["demonstrations"]["tasks"].items()
     )
-    flags = {"num_future_tokens": "num-future-tokens", "steps": "training-steps", "seed": "seed"}
-    train = " ".join(f"--{flag} {settings[name]}" for name, flag in flags.items())
-    return f"{weights}; {episodes}, then `saccade train {train}`."
+    defaults = TrainingSettings().to_dict()
+    other = {name: value for name, value in settings.items() if value != defaults.get(name, value)}
+    flags = {"steps": "training_steps"}
+    train = " ".join(f"--{flags.get(name, name).replace('_', '-')} {value}" for name, value in other.items())
+    return f"{weights}; {episodes}, then `saccade train {train}`, which has the seed {settings['seed']}."
 
 
 def loop_section(measured: Mapping[str, Any]) -> list[str]:
@@ -99,14 +103,13 @@ def calibration_section(measured: Mapping[str, Any]) -> list[str]:
     """How long calibration takes."""
     words = (
         f"`saccade quantize --calibrate` of the same policy, for {measured['observations']} observations "
-        f"({measured['weights']} weights): {measured['seconds'] / 60:.1f} minutes "
-        "(the machine was in use: less on an idle one), and at most "
+        f"({measured['weights']} weights): {measured['seconds'] / 60:.1f} minutes, and at most "
         f"{measured['peak'] / 1e9:.1f} GB of memory."
     )
     parts = ["## Calibration", words]
     return [
         *parts,
-        "Errors as above, on others of its random observations:",
+        f"Errors as above, on {MEASURED} other random observations:",
         errors({NAME: measured["errors"]}),
     ]
 

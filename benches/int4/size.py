@@ -75,7 +75,7 @@ def calibrated(work: Path) -> tuple[Model, dict[str, Path]]:
     policy = saccade.Policy.from_pretrained(one)
     observations = [policy.example_observation(seed=CALIBRATED + seed) for seed in range(MEASURED)]
     folders = {"int4": plain, "int4, calibrated": work / "calibrated-full"}
-    return Model("N1.5 at its published size", one, [], observations), folders
+    return Model("outliers, N1.5 at its published size", one, [], observations), folders
 
 
 def _calibrate(checkpoint: Path, out: Path, threads: int) -> dict[str, Any]:

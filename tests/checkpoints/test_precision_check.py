@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import weakref
 from pathlib import Path
 from typing import Any
 
@@ -111,10 +112,31 @@ def test_a_reference_of_another_robot_is_refused(frames: Path, tmp_path: Path) -
     statistics["max"] = statistics["min"]
     path.write_text(json.dumps(metadata))
     options: dict[str, Any] = {"instruction": "open it", "embodiment": EMBODIMENT}
-    with pytest.raises(InputError, match=r"in its weights alone, got another second, moving of arm"):
+    with pytest.raises(InputError, match=r"in its weights alone, got other statistics of the action arm"):
         check_precisions(source, frames, reference=other, **options)
-    with pytest.raises(InputError, match="in its weights alone, got another"):
+    metadata = json.loads((source / "experiment_cfg" / "metadata.json").read_text())
+    statistics = metadata[EMBODIMENT]["statistics"]["state"]["arm"]
+    statistics["max"] = [1 + number for number in statistics["max"]]
+    path.write_text(json.dumps(metadata))
+    with pytest.raises(InputError, match="got other images, tokens or states, as the models are given them"):
+        check_precisions(source, frames, reference=other, **options)
+    with pytest.raises(InputError, match=r"got other .* of the head"):
         check_precisions(source, frames, reference=whole("n16"), **options)
+
+
+def test_one_policy_at_a_time_is_in_memory(frames: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    load, loaded = saccade.Policy.from_pretrained, []
+
+    def watched(*arguments: Any, **options: Any) -> saccade.Policy:
+        assert not any(policy() is not None for policy in loaded)
+        policy = load(*arguments, **options)
+        loaded.append(weakref.ref(policy))
+        return policy
+
+    monkeypatch.setattr(saccade.Policy, "from_pretrained", watched)
+    source = whole("isaac")
+    check_precisions(source, frames, reference=source, instruction="open it", embodiment=EMBODIMENT)
+    assert len(loaded) == 2 + len(PRECISIONS)
 
 
 def test_ranges_are_those_of_the_statistics() -> None:

@@ -190,6 +190,7 @@ def run(args: argparse.Namespace) -> int:
 
 def prepare(args: argparse.Namespace, workers: Workers) -> Session:
     """Loads the policy and what is there of the results; nothing is written yet."""
+    from saccade._internal.environment import library
     from saccade._internal.hub import locate
     from saccade.evaluation.source import weights_hash
     from saccade_lab.libero import packages
@@ -243,7 +244,7 @@ def prepare(args: argparse.Namespace, workers: Workers) -> Session:
     check_trials(policy, tasks, args.trials)
     about = {
         "tasks": tasks,
-        "engine": {"num_threads": policy.whole.head.num_threads},
+        "engine": {"num_threads": policy.whole.head.num_threads, "library": library()},
         "processes": {"backend": workers.backend, "jobs": workers.jobs},
     }
     if not args.json:

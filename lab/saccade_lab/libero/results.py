@@ -110,9 +110,9 @@ class Results:
             repeated = [key for key, count in Counter(one.key for one in episodes).items() if count > 1]
             if repeated:
                 raise ValueError(f"{' '.join(map(str, repeated[0]))} is there twice")
-            # The first records had no dot products.
+            # The first records had no dot products, which float32 does not use.
             earlier = {name: record[name] for name in SETTINGS if name != "dot_products"}
-            earlier["dot_products"] = record.get("dot_products")
+            earlier["dot_products"] = record.get("dot_products", [] if _is_float32(record) else None)
             different = _different(earlier, json.loads(json.dumps(settings)))
         except (KeyError, TypeError, ValueError, AttributeError) as error:
             raise InputError(
@@ -269,6 +269,10 @@ def _decisive(protocol: Mapping[str, Any]) -> dict[str, Any]:
     rule = protocol["gripper"]["rule"]
     reasons = ("chosen", "execute_steps_reason", "remark")
     return {**{name: value for name, value in protocol.items() if name not in reasons}, "gripper": rule}
+
+
+def _is_float32(record: Mapping[str, Any]) -> bool:
+    return set(record["options"]["precision"].values()) == {"float32"}
 
 
 def software(precision: Mapping[str, str]) -> dict[str, Any]:

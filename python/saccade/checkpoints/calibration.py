@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import os
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -19,6 +18,7 @@ from saccade._internal import run_settings
 from saccade._internal.arrays import Float32Array, integer
 from saccade._internal.environment import library
 from saccade.backbone.backbone import Backbone
+from saccade.checkpoints.given_inputs import inputs_sha256
 from saccade.errors import CheckpointError, InputError
 from saccade.head.head import ActionHead
 from saccade.observations import ParsedObservation
@@ -124,7 +124,7 @@ def round_layers(given: Calibration, rewrite: Mapping[str, Any], folder: Path) -
     head_prefix, backbone_prefix, names = _saccade.quantized_weights(dict(rewrite))
     note = {
         "observations": len(given.observations),
-        "inputs_sha256": runs.digest(),
+        "inputs_sha256": inputs_sha256(given.policy, given.observations),
         "seed": given.seed,
         "embodiment_id": given.policy.embodiment_id,
     }
@@ -271,22 +271,6 @@ class _Runs:
         self.given, self.policy = given, policy
         self.processor, self.backbone, self.head = policy.processor, policy.backbone, policy.head
         self._features: dict[int, tuple[_Features, ...]] = {}
-
-    def digest(self) -> str:
-        """SHA-256 of what the models are given: pixels, tokens and normalised states."""
-        found = hashlib.sha256()
-        for given in self.given.observations:
-            parsed = read_observations(given, self.policy.requirements)
-            arrays: list[Any] = [self.policy.normalizer.state(parsed.state)]
-            for inputs in prepare_inputs(parsed, self.processor):
-                pixels = inputs.pixel_values
-                arrays += [*(pixels if isinstance(pixels, tuple) else (pixels,))]
-                arrays += [inputs.input_ids, inputs.attention_mask, inputs.image_grid_thw]
-            for array in arrays:
-                values = np.ascontiguousarray(() if array is None else array)
-                found.update(f"{values.dtype} {values.shape}\n".encode())
-                found.update(values.tobytes())
-        return found.hexdigest()
 
     def watch(
         self, part: str, wanted: Sequence[str], count: int, done: Callable[[], None] = lambda: None

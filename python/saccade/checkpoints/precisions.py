@@ -16,6 +16,7 @@ import numpy.typing as npt
 
 from saccade._internal.arrays import Float32Array, integer
 from saccade.checkpoints.description import describe
+from saccade.checkpoints.given_inputs import inputs_sha256
 from saccade.errors import InputError
 from saccade.observations.pictures import PictureObservation, read_frames
 from saccade.policy.policy import Policy
@@ -144,8 +145,8 @@ def check_precisions(
     Raises:
         FileNotFoundError, CheckpointError, InputError, ShapeError, DtypeError: As
             :meth:`saccade.Policy.from_pretrained` and :func:`saccade.observations.pictures.read_frames`.
-        InputError: ``reference`` has another head, other actions or statistics than ``source``, or its
-            features have another shape.
+        InputError: ``reference`` differs from ``source`` in more than its weights: sizes of the head,
+            embodiment, statistics, preprocessing, or the shape of its features.
 
     Example:
         >>> from pathlib import Path
@@ -179,9 +180,14 @@ def check_precisions(
 
     step()
     first, first_precision = next(iter(PRECISIONS.items()))
-    policy = load(source if reference is None else reference, first_precision)
+    policy = load(source, first_precision)
     groups = policy.normalizer.action_groups
     recorded = read_frames(directory, policy, instruction=instruction, state=state)
+    if reference is not None:
+        expected = _described(policy, recorded)
+        del policy  # before the next one is loaded
+        policy = load(reference, first_precision)
+        _check_alike(_described(policy, recorded), expected)
     exact = run(policy, recorded, seed)
     others = run(policy, recorded, seed + len(recorded))
     other_noise = difference(exact.actions, others.actions, groups)
@@ -190,10 +196,8 @@ def check_precisions(
         results = exact
         if reference is not None or name != first:
             step()
-            exact_policy, policy = policy, load(source, precision)
-            if not found:
-                _check_alike(exact_policy, policy)
-            del exact_policy
+            del policy
+            policy = load(source, precision)
             results = run(policy, recorded, seed)
         found.append(
             PrecisionError(
@@ -225,26 +229,30 @@ def _is_quantized(source: str | os.PathLike[str]) -> bool:
     return any(tensor.dtype in ("I8", "U8") and f"{tensor.name}_scale" in names for tensor in tensors)
 
 
-def _check_alike(reference: Policy, source: Policy) -> None:
-    """Checks that actions of two policies can be compared, number by number and in the same range."""
-    expected = "reference: expected one that differs from source in its weights alone"
-    configs = [dataclasses.asdict(policy.head.config) for policy in (reference, source)]
-    if other := [name for name, value in configs[1].items() if configs[0][name] != value]:
-        raise InputError(f"{expected}, got another {', '.join(other)}")
-    groups = [[_values(group) for group in one.normalizer.action_groups] for one in (reference, source)]
-    if [group["key"] for group in groups[0]] != [group["key"] for group in groups[1]]:
-        raise InputError(f"{expected}, got actions {', '.join(group['key'] for group in groups[0])}")
-    for theirs, ours in zip(*groups, strict=True):
-        if other := [name for name, value in ours.items() if theirs[name] != value]:
-            raise InputError(f"{expected}, got another {', '.join(other)} of {ours['key']}")
+def _described(policy: Policy, recorded: Sequence[PictureObservation]) -> dict[str, Any]:
+    """All of a policy but its weights: sizes, statistics, and what the models are given."""
+    sizes = dataclasses.asdict(policy.head.config)
+    found = {f"{name} of the head": value for name, value in sizes.items()}
+    for group in policy.normalizer.action_groups:
+        fields = vars(group).items()
+        found[f"statistics of the action {group.key}"] = {
+            name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in fields
+        }
+    found["embodiment"] = policy.embodiment_id
+    observations = [one.observation for one in recorded]
+    found["images, tokens or states, as the models are given them"] = inputs_sha256(policy, observations)
+    return found
 
 
-def _values(group: Group) -> dict[str, Any]:
-    """The fields of a group, which can be compared."""
-    return {
-        name: value.tolist() if isinstance(value, np.ndarray) else value
-        for name, value in vars(group).items()
-    }
+def _check_alike(reference: Mapping[str, Any], source: Mapping[str, Any]) -> None:
+    """Checks that two policies differ in their weights alone, so that their actions can be compared."""
+    names = dict.fromkeys((*source, *reference))
+    other = [name for name in names if name not in source or reference.get(name) != source[name]]
+    if other:
+        raise InputError(
+            "reference: expected one that differs from source in its weights alone, got other "
+            f"{'; other '.join(other)}"
+        )
 
 
 def recommended(found: Sequence[PrecisionError]) -> str | None:
