@@ -125,7 +125,8 @@ def test_a_reference_of_another_robot_is_refused(frames: Path, tmp_path: Path) -
 
 
 def test_one_policy_at_a_time_is_in_memory(frames: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    load, loaded = saccade.Policy.from_pretrained, []
+    load = saccade.Policy.from_pretrained
+    loaded: list[weakref.ref[saccade.Policy]] = []
 
     def watched(*arguments: Any, **options: Any) -> saccade.Policy:
         assert not any(policy() is not None for policy in loaded)
