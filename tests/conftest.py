@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import gc
 import importlib.util
 import os
+import weakref
 from pathlib import Path
+from typing import Any
 
 import hypothesis
 import pytest
 
+import saccade
 from saccade import _saccade
 from tests.helpers.progress import Progress
 from tests.helpers.released import NAMES, Released, load_released
@@ -55,6 +59,26 @@ def isa(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
     """Each instruction set that this machine has. Heads built in the test use it."""
     monkeypatch.setenv("SACCADE_ISA", request.param)
     return str(request.param)
+
+
+@pytest.fixture
+def held_at_loads(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """How many policies this process holds whenever one is loaded; none is held at first."""
+    from saccade.evaluation.source import forget_policy
+
+    load, most = saccade.Policy.from_pretrained, []
+    loaded: list[weakref.ref[saccade.Policy]] = []
+
+    def counted(*arguments: Any, **options: Any) -> saccade.Policy:
+        gc.collect()
+        most.append(sum(one() is not None for one in loaded))
+        policy = load(*arguments, **options)
+        loaded.append(weakref.ref(policy))
+        return policy
+
+    forget_policy()
+    monkeypatch.setattr(saccade.Policy, "from_pretrained", counted)
+    return most
 
 
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
