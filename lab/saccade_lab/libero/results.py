@@ -111,8 +111,9 @@ class Results:
             if repeated:
                 raise ValueError(f"{' '.join(map(str, repeated[0]))} is there twice")
             # The first records had no dot products, which float32 does not use.
+            unsaid: list[str] | None = [] if _is_float32(record["options"]["precision"]) else None
             earlier = {name: record[name] for name in SETTINGS if name != "dot_products"}
-            earlier["dot_products"] = record.get("dot_products", [] if _is_float32(record) else None)
+            earlier["dot_products"] = record.get("dot_products", unsaid)
             different = _different(earlier, json.loads(json.dumps(settings)))
         except (KeyError, TypeError, ValueError, AttributeError) as error:
             raise InputError(
@@ -271,8 +272,8 @@ def _decisive(protocol: Mapping[str, Any]) -> dict[str, Any]:
     return {**{name: value for name, value in protocol.items() if name not in reasons}, "gripper": rule}
 
 
-def _is_float32(record: Mapping[str, Any]) -> bool:
-    return set(record["options"]["precision"].values()) == {"float32"}
+def _is_float32(precision: Mapping[str, str]) -> bool:
+    return set(precision.values()) == {"float32"}
 
 
 def software(precision: Mapping[str, str]) -> dict[str, Any]:
@@ -287,7 +288,7 @@ def software(precision: Mapping[str, str]) -> dict[str, Any]:
     return {
         "saccade": found["saccade"],
         "instruction_set": found["instruction_set"],
-        "dot_products": [] if set(precision.values()) == {"float32"} else found["dot_products"],
+        "dot_products": [] if _is_float32(precision) else found["dot_products"],
         "packages": {name: _version(name) for name in PACKAGES},
     }
 

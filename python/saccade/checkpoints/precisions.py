@@ -7,6 +7,8 @@ import os
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
+from itertools import count
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -156,37 +158,27 @@ def check_precisions(
     """
     seed = integer("seed", seed, least=0)
 
-    def load(checkpoint: str | os.PathLike[str], precision: Mapping[str, str]) -> Policy:
-        return Policy.from_pretrained(
-            checkpoint,
-            embodiment=embodiment,
-            preprocessing=preprocessing,
-            tokenizer=tokenizer,
-            data_config=data_config,
-            action_horizon=action_horizon,
-            processor_options=processor_options,
-            precision=precision,
-            num_threads=num_threads,
-        )
-
-    todo = len(PRECISIONS) + (reference is not None)
-    done = 0
-
-    def step() -> None:
-        nonlocal done
-        if progress is not None:
-            progress(done, todo)
-        done += 1
-
-    step()
+    load = partial(
+        Policy.from_pretrained,
+        embodiment=embodiment,
+        preprocessing=preprocessing,
+        tokenizer=tokenizer,
+        data_config=data_config,
+        action_horizon=action_horizon,
+        processor_options=processor_options,
+        num_threads=num_threads,
+    )
+    report = progress or (lambda done, total: None)
+    done, todo = count(), len(PRECISIONS) + (reference is not None)
+    report(next(done), todo)
     first, first_precision = next(iter(PRECISIONS.items()))
-    policy = load(source, first_precision)
+    policy = load(source, precision=first_precision)
     groups = policy.normalizer.action_groups
     recorded = read_frames(directory, policy, instruction=instruction, state=state)
     if reference is not None:
         expected = _described(policy, recorded)
         del policy  # before the next one is loaded
-        policy = load(reference, first_precision)
+        policy = load(reference, precision=first_precision)
         _check_alike(_described(policy, recorded), expected)
     exact = run(policy, recorded, seed)
     others = run(policy, recorded, seed + len(recorded))
@@ -195,9 +187,9 @@ def check_precisions(
     for name, precision in PRECISIONS.items():
         results = exact
         if reference is not None or name != first:
-            step()
+            report(next(done), todo)
             del policy
-            policy = load(source, precision)
+            policy = load(source, precision=precision)
             results = run(policy, recorded, seed)
         found.append(
             PrecisionError(

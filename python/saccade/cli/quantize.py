@@ -32,9 +32,8 @@ in a byte, with a float32 scale for each output in X.weight_scale: those of the 
 backbone unless --keep-backbone or --head-only is given. With --to int4 its token embeddings become int8. All
 other tensors are copied bit for bit, and so are the other files of the checkpoint, such as statistics,
 processors and tokenizers. Policy.from_pretrained(DIR, precision="int8") gives the same bits as loading
-CHECKPOINT at int8, and so with int4 unless it is calibrated.
-The other precisions load it too, with the dequantized weights. docs/precision.md says how much they change
-actions.
+CHECKPOINT at int8, and so with int4 unless it is calibrated. The other precisions load it too, with the
+dequantized weights. docs/precision.md says how much they change actions.
 
 --calibrate rounds int4 weights so that the outputs of their layers change least on observations of yours
 (GPTQ). The whole checkpoint is run in float32 on all of them, once for every GiB of matrices that this needs:
