@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import itertools
+from collections import deque
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import numpy.typing as npt
@@ -100,6 +103,28 @@ class Batches:
         if self._shift:
             images = shifted(images, self._shift, rng)
         return backbone_inputs(images, prompts, self._version)
+
+
+def drawn(batches: Batches, seed: int, steps: range, threads: int) -> Iterator[Batch]:
+    """The batches of training steps, which are the same however they are drawn.
+
+    Args:
+        batches: Draws them.
+        seed: Seed of the run.
+        steps: Numbers of the steps.
+        threads: How many draw the next batches while one is used, for a device that leaves the CPU idle; with
+            0 each is drawn when it is asked for.
+    """
+    if threads == 0:
+        yield from (batches.draw(seed, step) for step in steps)
+        return
+    with ThreadPoolExecutor(threads) as pool:
+        draws = (pool.submit(batches.draw, seed, step) for step in steps)
+        ahead = deque(itertools.islice(draws, 2 * threads))
+        while ahead:
+            batch = ahead.popleft().result()
+            ahead.extend(itertools.islice(draws, 1))
+            yield batch
 
 
 def prompts_of(config: PolicyFiles, processor: Processor) -> list[list[npt.NDArray[np.int64]]]:

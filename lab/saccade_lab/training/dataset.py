@@ -4,9 +4,11 @@ Frames and words are prepared by the processor that runs the policy later, so th
 the same.
 """
 
+import functools
 import hashlib
 import json
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -106,30 +108,36 @@ def load_samples(
         InputError: A task has no demonstrations.
     """
     parts: tuple[list[Samples], list[Samples]] = ([], [])
-    for task, task_number in zip(tasks, numbers or map(list(TASKS).index, tasks), strict=True):
-        found = 0
-        episodes = demos.episodes(directory, task, images=processor is not None)
-        for number, (_, demonstration) in enumerate(episodes):
-            found += 1
-            actions, mask = chunks(demonstration, horizon)
-            keep = mask[..., 0].sum(axis=1) >= MIN_VALID_ACTIONS
-            without = np.empty((len(demonstration.images), 0, 3, 0, 0), np.uint8)
-            samples = Samples(
-                images=without if processor is None else prepared(demonstration.images, processor),
-                now=np.flatnonzero(keep),
-                later=later_frames(demonstration, horizon)[keep],
-                state=demonstration.proprio[keep],
-                targets=demonstration.targets[keep],
-                actions=actions[keep],
-                mask=mask[keep],
-                tasks=np.full(int(keep.sum()), task_number, dtype=np.int64),
-            )
-            held_out = number % VALIDATION_EVERY == VALIDATION_EVERY - 1
-            parts[held_out].append(samples)
-        if found == 0:
-            raise InputError(f"{directory}: no demonstrations of {task}")
+    with ThreadPoolExecutor() as threads:  # preparing frames takes most of the time, and lets others run
+        for task, number in zip(tasks, numbers or map(list(TASKS).index, tasks), strict=True):
+            episodes = demos.episodes(directory, task, images=processor is not None)
+            read = functools.partial(samples_of, task=number, horizon=horizon, processor=processor)
+            found = list(threads.map(read, (demonstration for _, demonstration in episodes)))
+            if not found:
+                raise InputError(f"{directory}: no demonstrations of {task}")
+            for place, samples in enumerate(found):
+                parts[place % VALIDATION_EVERY == VALIDATION_EVERY - 1].append(samples)
     training = join(parts[0])
     return training, join(parts[1]) if parts[1] else training
+
+
+def samples_of(
+    demonstration: demos.Demonstration, *, task: int, horizon: int, processor: Processor | None
+) -> Samples:
+    """The samples of one demonstration; the arguments are as in ``load_samples``."""
+    actions, mask = chunks(demonstration, horizon)
+    keep = mask[..., 0].sum(axis=1) >= MIN_VALID_ACTIONS
+    without = np.empty((len(demonstration.images), 0, 3, 0, 0), np.uint8)
+    return Samples(
+        images=without if processor is None else prepared(demonstration.images, processor),
+        now=np.flatnonzero(keep),
+        later=later_frames(demonstration, horizon)[keep],
+        state=demonstration.proprio[keep],
+        targets=demonstration.targets[keep],
+        actions=actions[keep],
+        mask=mask[keep],
+        tasks=np.full(int(keep.sum()), task, dtype=np.int64),
+    )
 
 
 def describe(directory: Path, tasks: list[str]) -> dict[str, Any]:

@@ -46,10 +46,9 @@ def shifted(images: npt.NDArray[np.uint8], largest: int, rng: np.random.Generato
     moves = rng.integers(-largest, largest, endpoint=True, size=(len(views), 2))
     height, width = views.shape[2:]
     out = np.empty_like(views)
-    for view, (down, right) in enumerate(moves):
-        rows = np.clip(np.arange(height) + down, 0, height - 1)
-        columns = np.clip(np.arange(width) + right, 0, width - 1)
-        out[view] = views[view][:, rows[:, None], columns]
+    for view, (down, right) in enumerate(largest + moves):
+        wider = np.pad(views[view], ((0, 0), (largest, largest), (largest, largest)), mode="edge")
+        out[view] = wider[:, down : down + height, right : right + width]
     return out.reshape(images.shape)
 
 

@@ -42,16 +42,17 @@ from saccade_lab.sim.settings import (
     vocabulary,
 )
 from saccade_lab.sim.tasks import ACTION_DIM, PROPRIO_DIM, find_task
-from saccade_lab.training.batches import Batches, prompts_of
+from saccade_lab.training.batches import Batches, drawn, prompts_of
 from saccade_lab.training.dataset import Samples, describe, load_samples
 from saccade_lab.training.frozen import FrozenFeatures
-from saccade_lab.training.learner import Learner, new_learner
+from saccade_lab.training.learner import Batch, Learner, new_learner
 from saccade_lab.training.policy_files import PolicyFiles
 from saccade_lab.training.settings import STATE_FILE as STATE_FILE
 from saccade_lab.training.settings import TrainingSettings, features_name
 from saccade_lab.training.sizes import small_configs
 
 CHECKPOINT_SECONDS = 60.0
+DRAWING_THREADS = 4  # beside another device than the CPU
 VALIDATION_FRAMES = 256
 WARMUP_STEPS = 200
 MAX_GRADIENT_NORM = 1.0
@@ -141,7 +142,7 @@ def learning_rate(settings: TrainingSettings, step: int) -> float:
     return settings.learning_rate * warmup * 0.5 * (1.0 + math.cos(math.pi * step / settings.steps))
 
 
-def train_step(run: Run, batches: Batches) -> dict[str, float]:
+def train_step(run: Run, batch: Batch) -> dict[str, float]:
     """One optimiser step; returns the losses by name."""
     settings = run.settings
     for group in run.optimizer.param_groups:
@@ -149,7 +150,7 @@ def train_step(run: Run, batches: Batches) -> dict[str, float]:
     generator = torch.Generator().manual_seed(
         int(np.random.default_rng((settings.seed, run.step, 1)).integers(2**63))
     )
-    losses = run.learner.losses(batches.draw(settings.seed, run.step), generator, run.average)
+    losses = run.learner.losses(batch, generator, run.average)
     weights = {"target_loss": settings.target_weight, "alignment_loss": settings.alignment_weight}
     total = losses["loss"]
     for name, weight in weights.items():
@@ -387,17 +388,19 @@ def loop(
     """Trains to the last step and saves about once a minute."""
     saved, steps = time.monotonic(), list[dict[str, float]]()
     latest: float | None = None
-    while run.step < run.settings.steps:
-        steps.append(train_step(run, batches))
+    settings = run.settings
+    threads = 0 if next(run.learner.parameters()).is_cpu else DRAWING_THREADS
+    for batch in drawn(batches, settings.seed, range(run.step, settings.steps), threads):
+        steps.append(train_step(run, batch))
         means = {name: sum(losses[name] for losses in steps) / len(steps) for name in steps[0]}
-        if time.monotonic() - saved > CHECKPOINT_SECONDS or run.step == run.settings.steps:
+        if time.monotonic() - saved > CHECKPOINT_SECONDS or run.step == settings.steps:
             held_out_losses = validation_losses(run, held_out)
             validation = {f"validation_{name}": loss for name, loss in held_out_losses.items()}
             run.history.append({"step": run.step, **means, **validation})
             save(run, out)
             latest = held_out_losses["loss"]
             saved, steps = time.monotonic(), []
-        on_step(Progress(run.step, run.settings.steps, means["loss"], latest))
+        on_step(Progress(run.step, settings.steps, means["loss"], latest))
 
 
 def plot_history(history: list[dict[str, Any]], path: Path) -> None:

@@ -144,9 +144,9 @@ def test_without_alignment_steps_are_those_of_the_two_losses(recording: Path) ->
         betas=(0.9, 0.95),
     )
     for step in range(3):
-        found = train.train_step(run, batches)
-        assert found.keys() == {"loss", "target_loss"}
         batch = batches.draw(settings.seed, step)
+        found = train.train_step(run, batch)
+        assert found.keys() == {"loss", "target_loss"}
         assert batch.later is None
         for group in optimizer.param_groups:
             group["lr"] = train.learning_rate(settings, step)

@@ -19,6 +19,7 @@ from saccade import InputError
 from saccade.backbone.inputs import BackboneInputs
 from saccade_lab.sim.policy import DEMO_CHECKPOINT, Policy
 from saccade_lab.training import train
+from saccade_lab.training.batches import drawn
 from saccade_lab.training.learner import Learner
 from saccade_lab.training.settings import TrainingSettings
 from tests.helpers.training_cases import ALIGNED, RECORDING, TASKS, TINY, ignore, make_batches, recorded
@@ -53,6 +54,23 @@ def test_training_resumes_to_the_same_weights(
     ends = [torch.load(tmp_path / name / "training.pt", weights_only=True) for name in ("whole", "parts")]
     for name, tensor in ends[0]["learner"].items():  # including what is trained besides the policy
         assert torch.equal(tensor, ends[1]["learner"][name]), name
+
+
+@pytest.mark.parametrize("stop", [0, 1, 9])
+def test_batches_drawn_ahead_are_those_of_their_steps(recording: Path, stop: int) -> None:
+    run, batches = make_batches(recording, TINY)
+    steps = range(2, 2 + stop)
+    ahead = list(drawn(batches, run.settings.seed, steps, threads=2))
+    for batch, step in zip(ahead, steps, strict=True):
+        expected = batches.draw(run.settings.seed, step)
+        assert isinstance(batch.inputs, BackboneInputs)
+        assert isinstance(expected.inputs, BackboneInputs)
+        np.testing.assert_array_equal(batch.inputs.pixel_values, expected.inputs.pixel_values)
+        np.testing.assert_array_equal(batch.inputs.input_ids, expected.inputs.input_ids)
+        for name in ("state", "actions", "mask", "targets"):
+            assert torch.equal(getattr(batch, name), getattr(expected, name)), name
+    if stop > 1:
+        assert any(not torch.equal(ahead[0].state, other.state) for other in ahead[1:])
 
 
 def test_training_leaves_a_policy_both_engines_run(recording: Path, tmp_path: Path) -> None:

@@ -210,7 +210,8 @@ class Qwen3VlModel(nn.Module):
         tokens, stacked = self.visual(patches.to(weight), grids)  # (N, width) each
         image_mask = ids == sizes.image_token
         x = with_image_tokens(decoder.embed_tokens(ids), image_mask, tokens)
-        positions = prompt_positions(ids.cpu(), mask.cpu(), grids, sizes).to(ids.device)  # (3, B, T)
+        given = torch.from_numpy(inputs.input_ids), torch.from_numpy(inputs.attention_mask)
+        positions = prompt_positions(*given, grids, sizes).to(ids.device)  # (3, B, T)
         text = sizes.text
         angles = interleaved_angles(positions, text.theta, text.head_dim // 2, text.sections, weight.dtype)
         return decoder(x, angles, mask, added_after(stacked, image_mask))

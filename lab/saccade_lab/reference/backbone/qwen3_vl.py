@@ -197,24 +197,23 @@ def prompt_positions(
     positions = torch.ones((3, *input_ids.shape), dtype=torch.long)
     remaining = iter(grids)
     for row, (ids, attended) in enumerate(zip(input_ids, attention_mask, strict=True)):
-        number, column = 0, 0
-        kept = attended.nonzero()[:, 0]
-        tokens = ids[kept].tolist()
-        while column < len(tokens):
-            if tokens[column] != sizes.image_token:
-                positions[:, row, kept[column]] = number
-                number, column = number + 1, column + 1
+        places = attended.nonzero()[:, 0]
+        tokens = ids[places].tolist()
+        found: list[tuple[int, int, int]] = []  # of each token: time, height, width
+        number = 0
+        while len(found) < len(tokens):
+            if tokens[len(found)] != sizes.image_token:
+                found.append((number, number, number))
+                number += 1
                 continue
             height, width = (side // sizes.merge for side in next(remaining, (0, 0)))
-            found = tokens[column : column + height * width]
-            if found != [sizes.image_token] * (height * width) or not found:
+            image = tokens[len(found) : len(found) + height * width]
+            if image != [sizes.image_token] * (height * width) or not image:
                 raise InputError(
                     f"input_ids: expected {height} x {width} image tokens of a view from position "
-                    f"{int(kept[column])} of prompt {row}"
+                    f"{int(places[len(found)])} of prompt {row}"
                 )
-            r = torch.arange(height)[:, None].expand(height, width).flatten()
-            c = torch.arange(width).expand(height, width).flatten()
-            places = kept[column : column + height * width]
-            positions[:, row, places] = number + torch.stack((torch.zeros_like(r), r, c))
-            number, column = number + max(height, width), column + height * width
+            found += [(number, number + r, number + c) for r in range(height) for c in range(width)]
+            number += max(height, width)
+        positions[:, row, places] = torch.tensor(found, dtype=torch.long).reshape(-1, 3).T
     return positions
