@@ -45,10 +45,11 @@ def shifted(images: npt.NDArray[np.uint8], largest: int, rng: np.random.Generato
     views = images.reshape(-1, *images.shape[2:])
     moves = rng.integers(-largest, largest, endpoint=True, size=(len(views), 2))
     height, width = views.shape[2:]
+    edges = (largest, largest)
+    wider = np.pad(views, ((0, 0), (0, 0), edges, edges), mode="edge")
     out = np.empty_like(views)
     for view, (down, right) in enumerate(largest + moves):
-        wider = np.pad(views[view], ((0, 0), (largest, largest), (largest, largest)), mode="edge")
-        out[view] = wider[:, down : down + height, right : right + width]
+        out[view] = wider[view, :, down : down + height, right : right + width]
     return out.reshape(images.shape)
 
 

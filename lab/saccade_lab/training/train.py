@@ -52,7 +52,6 @@ from saccade_lab.training.settings import TrainingSettings, features_name
 from saccade_lab.training.sizes import small_configs
 
 CHECKPOINT_SECONDS = 60.0
-DRAWING_THREADS = 4  # beside another device than the CPU
 VALIDATION_FRAMES = 256
 WARMUP_STEPS = 200
 MAX_GRADIENT_NORM = 1.0
@@ -74,12 +73,18 @@ class Progress:
 
 @dataclass
 class Run:
-    """A training run in memory."""
+    """A training run in memory.
+
+    Attributes:
+        tensors: Those of the policy, as the steps change them.
+        average: Their averages, which are what is saved.
+    """
 
     settings: TrainingSettings
     config: PolicyFiles
     learner: Learner
     optimizer: torch.optim.Optimizer
+    tensors: dict[str, Tensor]
     average: dict[str, Tensor]
     demonstrations: dict[str, Any]
     step: int = 0
@@ -132,8 +137,9 @@ def new_run(
         betas=BETAS,
         foreach=True,
     )
-    average = {name: tensor.detach().clone() for name, tensor in learner.policy_tensors().items()}
-    return Run(settings, config, learner, optimizer, average, demonstrations)
+    tensors = {name: tensor.detach() for name, tensor in learner.policy_tensors().items()}
+    average = {name: tensor.clone() for name, tensor in tensors.items()}
+    return Run(settings, config, learner, optimizer, tensors, average, demonstrations)
 
 
 def learning_rate(settings: TrainingSettings, step: int) -> float:
@@ -163,8 +169,7 @@ def train_step(run: Run, batch: Batch) -> dict[str, float]:
     # A short memory at first, so that the initial weights do not dominate the average.
     decay = min(settings.ema_decay, (1 + run.step) / (10 + run.step))
     with torch.no_grad():
-        current = run.learner.policy_tensors()
-        torch._foreach_lerp_(list(run.average.values()), list(current.values()), 1.0 - decay)
+        torch._foreach_lerp_(list(run.average.values()), list(run.tensors.values()), 1.0 - decay)
     run.step += 1
     return {name: loss.item() for name, loss in losses.items()}
 
@@ -172,7 +177,7 @@ def train_step(run: Run, batch: Batch) -> dict[str, float]:
 @torch.no_grad()
 def validation_losses(run: Run, batches: Batches) -> dict[str, float]:
     """The losses of the averaged weights, each time on the same held-out frames and noise."""
-    current = {name: tensor.clone() for name, tensor in run.learner.policy_tensors().items()}
+    current = {name: tensor.clone() for name, tensor in run.tensors.items()}
     run.learner.load_state_dict(run.average, strict=False)
     losses = run.learner.losses(batches.draw(0), torch.Generator().manual_seed(0), run.average)
     run.learner.load_state_dict(current, strict=False)
@@ -265,7 +270,7 @@ def start_from(run: Run, policy: Path) -> None:
         if name.startswith(prefix)
     }
     run.learner.load_state_dict(tensors, strict=False)
-    run.average = {name: tensor.detach().clone() for name, tensor in run.learner.policy_tensors().items()}
+    run.average = {name: tensor.clone() for name, tensor in run.tensors.items()}
 
 
 def features_of(samples: str, settings: TrainingSettings, recorded: dict[str, Any], out: Path) -> Path:
@@ -389,8 +394,8 @@ def loop(
     saved, steps = time.monotonic(), list[dict[str, float]]()
     latest: float | None = None
     settings = run.settings
-    threads = 0 if next(run.learner.parameters()).is_cpu else DRAWING_THREADS
-    for batch in drawn(batches, settings.seed, range(run.step, settings.steps), threads):
+    device = next(run.learner.parameters()).device
+    for batch in drawn(batches, settings.seed, range(run.step, settings.steps), device):
         steps.append(train_step(run, batch))
         means = {name: sum(losses[name] for losses in steps) / len(steps) for name in steps[0]}
         if time.monotonic() - saved > CHECKPOINT_SECONDS or run.step == settings.steps:

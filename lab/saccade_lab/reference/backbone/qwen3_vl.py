@@ -6,6 +6,9 @@ Module names follow the checkpoint. Shapes in comments: P are the patches of all
 # Calls of torch modules are untyped.
 # mypy: disable-error-code="no-any-return, no-untyped-call"
 
+import itertools
+from collections.abc import Iterator, Sequence
+
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
@@ -194,8 +197,28 @@ def prompt_positions(
     Raises:
         InputError: The image tokens of a prompt are not those of its views.
     """
+    if len(set(grids)) > 1:
+        return walked_positions(input_ids, attention_mask, iter(grids), sizes, range(len(input_ids)))
+    # A batch of training says the same few instructions again and again.
+    said = torch.where(attention_mask, input_ids, -1)
+    distinct, which = said.unique(dim=0, return_inverse=True)  # (D, T), (B,)
+    first = [which.tolist().index(number) for number in range(len(distinct))]
+    views = itertools.repeat(grids[0]) if grids else iter(())
+    return walked_positions(input_ids[first], attention_mask[first], views, sizes, first)[:, which]
+
+
+def walked_positions(
+    input_ids: Tensor,
+    attention_mask: Tensor,
+    grids: Iterator[tuple[int, int]],
+    sizes: BackboneSizes,
+    numbers: Sequence[int],
+) -> Tensor:
+    """The positions of prompts whose views have these grids, one after another.
+
+    As ``prompt_positions``; the prompts have ``numbers`` in their batch.
+    """
     positions = torch.ones((3, *input_ids.shape), dtype=torch.long)
-    remaining = iter(grids)
     for row, (ids, attended) in enumerate(zip(input_ids, attention_mask, strict=True)):
         places = attended.nonzero()[:, 0]
         tokens = ids[places].tolist()
@@ -206,12 +229,12 @@ def prompt_positions(
                 found.append((number, number, number))
                 number += 1
                 continue
-            height, width = (side // sizes.merge for side in next(remaining, (0, 0)))
+            height, width = (side // sizes.merge for side in next(grids, (0, 0)))
             image = tokens[len(found) : len(found) + height * width]
             if image != [sizes.image_token] * (height * width) or not image:
                 raise InputError(
                     f"input_ids: expected {height} x {width} image tokens of a view from position "
-                    f"{int(places[len(found)])} of prompt {row}"
+                    f"{int(places[len(found)])} of prompt {numbers[row]}"
                 )
             found += [(number, number + r, number + c) for r in range(height) for c in range(width)]
             number += max(height, width)
