@@ -2,6 +2,7 @@
 
     python -m benches.int4 errors [--small] [--policy DIR]  of actions, by precision and by group of layers
     python -m benches.int4 loop [--policy DIR]              success in closed loop on the same episodes
+    python -m benches.int4 libero FLOAT32 INT4              the same, of runs of `saccade libero`
     python -m benches.int4 full                             memory, loading and time at N1.5's published size
     python -m benches.int4 calibrate                        how long its calibration takes, and its errors
     python -m benches.int4 report [--write]                 prints the page, or writes docs/results/int4.md
@@ -21,7 +22,7 @@ from typing import Any
 
 import saccade
 from benches.checkpoints import written
-from benches.int4 import accuracy, closed_loop, groups, size, time
+from benches.int4 import accuracy, closed_loop, groups, libero, size, time
 from benches.int4.page import document
 from benches.pages.report import report
 from benches.peers.machine import describe
@@ -91,7 +92,12 @@ def calibrate(args: argparse.Namespace) -> dict[str, Any]:
     return found | {"errors": accuracy.measure(*size.calibrated(args.work), note)}
 
 
-MEASUREMENTS = {"errors": errors, "loop": loop, "full": full, "calibrate": calibrate}
+def on_libero(args: argparse.Namespace) -> dict[str, Any]:
+    """Success on LIBERO."""
+    return libero.measure(args.runs)
+
+
+MEASUREMENTS = {"errors": errors, "loop": loop, "libero": on_libero, "full": full, "calibrate": calibrate}
 
 
 def main() -> int:
@@ -109,6 +115,7 @@ def main() -> int:
     of["errors"].add_argument("--small", action="store_true", help="leave out the model of published width")
     of["loop"].add_argument("--episodes", type=int, default=300, help="of a policy (default: 300)")
     of["loop"].add_argument("--jobs", type=int, default=2, help="processes (default: 2)")
+    of["libero"].add_argument("runs", type=Path, nargs="+", metavar="DIR", help="that --out named")
     for word in ("full", "calibrate"):
         of[word].add_argument("--num-threads", type=int, default=2)
     args = parser.parse_args()

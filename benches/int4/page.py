@@ -30,6 +30,10 @@ Backbone and head at each precision, on the same episodes as float32: seeds that
 calibration used, an equal number of each task. Differences are in percentage points, with Tango's 95 %
 intervals; "no worse" means that the interval contains zero and excludes a loss of 5 points."""
 
+ABOUT_LIBERO = """\
+Checkpoint {sha256} ([how it was trained](../libero.md#train-a-policy)), by `saccade libero --protocol
+{protocol}` on the same official states and noise."""
+
 ABOUT_SIZE = """\
 A whole policy of N1.5's published size with random weights, planted outliers and one embodiment, loaded from
 what `saccade quantize` wrote, each load in a process of its own with the page cache dropped: medians. Peak
@@ -93,6 +97,13 @@ def loop_section(measured: Mapping[str, Any]) -> list[str]:
     return ["## Closed loop", ABOUT_LOOP, loops(measured)]
 
 
+def libero_section(measured: Mapping[str, Any]) -> list[str]:
+    """Success on LIBERO."""
+    sha256, protocol = measured["checkpoint"]["sha256"][:16], measured["protocol"]
+    words = ABOUT_LIBERO.format(sha256=sha256, protocol=protocol)
+    return ["## Closed loop on LIBERO", words, loops({measured["checkpoint"]["name"]: measured})]
+
+
 def full_section(measured: Mapping[str, Any]) -> list[str]:
     """Memory, loading and time at published size."""
     parts = ["## Memory and loading", ABOUT_SIZE, size(measured["size"])]
@@ -117,6 +128,7 @@ def calibration_section(measured: Mapping[str, Any]) -> list[str]:
 SECTIONS: dict[str, Callable[[Mapping[str, Any]], list[str]]] = {
     "errors": errors_section,
     "loop": loop_section,
+    "libero": libero_section,
     "full": full_section,
     "calibrate": calibration_section,
 }

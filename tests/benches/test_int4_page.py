@@ -49,6 +49,13 @@ def record() -> dict[str, Any]:
                 },
             }
         },
+        "libero": {
+            "checkpoint": {"name": "n17", "sha256": 64 * "c"},
+            "machine": {"cpu": "a CPU"},
+            "protocol": "lerobot",
+            "tasks": ["libero_object"],
+            "success": {"float32": [True, True, False], "int4": [True, False, False]},
+        },
         "full": {
             "size": {
                 "int8": {"file_bytes": 2_000_000_000, "loads": [LOAD, LOAD, {**LOAD, "load": 50.0}]},
@@ -73,11 +80,13 @@ def test_the_page() -> None:
         "| **a policy**: reach, push | | | |",
         "| float32 | 16 of 161 |  |  |",
         "| int4 | 6 of 161 | -6.2 (-12.4 to -0.5) | worse |",
+        "| **n17**: libero_object | | | |",
+        "| float32 | 2 of 3 |  |  |",
         "| sample | 200 | 180 | 0.90 (0.70 to 0.95) |",
     ):
         assert line in lines
     text = " ".join(lines)
-    assert text.count("a CPU (a family, avx2), 2 cores; commit abc") == 4
+    assert text.count("a CPU (a family, avx2), 2 cores; commit abc") == 5
     assert "rounded for 24 observations, and errors are those on 12." in text
     assert "The bundled policy: checkpoint aaaaaaaaaaaaaaaa." in text
     assert (
