@@ -14,7 +14,7 @@ from saccade.cli import main
 from saccade_lab.libero import demos
 from saccade_lab.libero.checkpoint import ACTION_GROUPS, CAMERAS, STATE_GROUPS
 from saccade_lab.libero.environment import LiberoEnvironment
-from saccade_lab.libero.expert import BasketExpert
+from saccade_lab.libero.expert import Expert
 from saccade_lab.libero.recording import read_recordings
 from saccade_lab.libero.scene import Scene
 from saccade_lab.parallel import Workers
@@ -32,12 +32,14 @@ def closed() -> Iterator[None]:
     environment_cache.close()
 
 
-@pytest.mark.parametrize("task", [1, 4])
-def test_the_expert_solves_official_starts(task: int) -> None:
-    environment = LiberoEnvironment("libero_object", task)
+@pytest.mark.parametrize(
+    ("suite", "task"),
+    [("libero_object", 1), ("libero_object", 4), ("libero_spatial", 3), ("libero_spatial", 7)],
+)
+def test_the_expert_solves_official_starts(suite: str, task: int) -> None:
+    environment = LiberoEnvironment(suite, task)
     environment.restart(3, 0)
-    inner = environment.simulation.inner
-    expert = BasketExpert(Scene(inner, inner.parsed_problem["goal_state"][0][1], demos.GOAL))
+    expert = Expert(demos.scene_of(environment), demos.EXPERTS[suite].manner)
     for _ in range(demos.MAX_STEPS):
         if environment.advance(expert.action()).success:
             break
@@ -65,7 +67,7 @@ def test_a_recording_shows_what_happened(tmp_path: Path) -> None:
     assert episode.images.shape == (len(episode.frame_steps), 2, 32, 32, 3)
     assert episode.proprio.shape == (len(episode.frame_steps), 8)
     # The same actions, or where the expert was disturbed other ones, lead to the same observations.
-    demos.start(environment, 6, SEED)
+    demos.start(environment, SMALL, SEED)
     undisturbed = int(np.argmax(episode.disturbed)) if episode.disturbed.any() else steps
     for step in range(undisturbed):
         if step % 30 == 0:
@@ -81,7 +83,7 @@ def test_starts_are_wider_than_the_official_ones() -> None:
     environment = LiberoEnvironment("libero_object", 1, settle_steps=0, official_states=False)
     places = []
     for seed in range(SEED, SEED + 6):
-        scene = demos.start(environment, 1, seed)
+        scene = demos.start(environment, demos.recording("libero_object", 1, 32, 30), seed)
         places.append([scene.position(name) for name in scene.names()])
         assert np.abs(environment.simulation.data.qvel).max() < 0.5  # all have come to rest
     found = np.array(places)
@@ -90,12 +92,30 @@ def test_starts_are_wider_than_the_official_ones() -> None:
     environment.close()
 
 
+def test_what_stands_on_something_moves_with_it_or_stays() -> None:
+    """A bowl in a drawer, and in another scene one on a box of cookies."""
+    for task, carrier in ((4, None), (3, "cookies_1")):
+        settings = demos.recording("libero_spatial", task, 32, 30)
+        environment = LiberoEnvironment("libero_spatial", task, settle_steps=0, official_states=False)
+        environment.restart(None, SEED)
+        before = demos.scene_of(environment)
+        assert before.carriers()[before.target] == carrier
+        assert before.carriers()["plate_1"] == "plate_1"
+        found = {name: before.position(name) for name in before.names()}
+        scene = demos.start(environment, settings, SEED)
+        moved = {name: (scene.position(name) - found[name])[:2] for name in scene.names()}
+        assert np.abs(moved["plate_1"]).max() > 0.004
+        expected = np.zeros(2) if carrier is None else moved[carrier]
+        np.testing.assert_allclose(moved[scene.target], expected, atol=0.004)  # metres; it has settled
+        environment.close()
+
+
 def test_points_span_the_shapes_of_objects() -> None:
     """MuJoCo has computed a box around each geom, which the points touch on all sides."""
     environment = LiberoEnvironment("libero_object", 0, settle_steps=0, official_states=False)
     environment.restart(None, SEED)
     model, data = environment.simulation.model, environment.simulation.data
-    scene = Scene(environment.simulation.inner, "alphabet_soup_1", demos.GOAL)
+    scene = Scene(environment.simulation.inner, "alphabet_soup_1", "basket_1")
     for name in scene.names():
         root = environment.simulation.inner.obj_body_id[name]
         corners = []

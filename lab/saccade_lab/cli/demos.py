@@ -50,7 +50,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--out", type=Path, metavar="DIR", help="directory of the recording, for `saccade train`"
     )
     lab_flags.add_record(parser)
-    parser.add_argument("--env", choices=("libero_object",), help="a suite of LIBERO instead of Meta-World")
+    parser.add_argument(
+        "--env",
+        choices=("libero_object", "libero_spatial"),
+        help="a suite of LIBERO instead of Meta-World",
+    )
     lab_flags.add_tasks(
         parser, "tasks to record (default: the five of the demo); numbers of LIBERO's tasks (default: all)"
     )

@@ -1,4 +1,4 @@
-"""Demonstrations of ``libero_object``: the scripted expert, recorded with both cameras of a policy.
+"""Demonstrations of LIBERO: the scripted expert, recorded with both cameras of a policy.
 
 They start from layouts that LIBERO's reset draws, spread further by ``placements``, never from an official
 initial state. Episodes, files and their continuation are as in ``saccade_lab.sim.demos``.
@@ -17,8 +17,8 @@ import numpy as np
 from saccade.datasets import Writer
 from saccade.errors import InputError
 from saccade_lab.libero.checkpoint import ACTION_GROUPS, CAMERAS, CONTROL_HZ, STATE_GROUPS, policy_actions
-from saccade_lab.libero.expert import BasketExpert
-from saccade_lab.libero.placements import wider
+from saccade_lab.libero.expert import INTO_BASKET, ONTO_PLATE, Expert, Manner
+from saccade_lab.libero.placements import TRADE_SHARE, wider
 from saccade_lab.libero.recording import LiberoRecording
 from saccade_lab.libero.scene import Scene
 from saccade_lab.libero.suites import SUITES, find_task
@@ -29,12 +29,29 @@ from saccade_lab.sim.experts import NoiseBursts
 if TYPE_CHECKING:
     from saccade_lab.libero.environment import LiberoEnvironment
 
-EXPERT_SUITES = ("libero_object",)  # in which every task is to put an object into the basket
+
+@dataclass(frozen=True)
+class Expertise:
+    """How the tasks of a suite are demonstrated, which all put one object somewhere.
+
+    Attributes:
+        manner: How the object is taken and let go.
+        trade_share: Share of the demonstrations in which objects trade places. None may where words say where
+            an object stands.
+    """
+
+    manner: Manner
+    trade_share: float
+
+
+EXPERTS: Mapping[str, Expertise] = {
+    "libero_object": Expertise(INTO_BASKET, TRADE_SHARE),
+    "libero_spatial": Expertise(ONTO_PLATE, 0.0),
+}
 DEFAULT_COUNT = 40
 IMAGE_SIZE, FRAME_STRIDE = 256, 5
 MAX_STEPS = 280  # as in evaluations; the expert needs 80 to 210
 SETTLE_STEPS = 10
-GOAL = "basket_1"
 ROBOT = "libero_panda"
 #: Milder than Meta-World's, because a step moves the hand further: up to 5 cm instead of 1.
 BURSTS: Mapping[str, Any] = {"start_probability": 0.02, "min_steps": 2, "max_steps": 6}
@@ -46,8 +63,8 @@ def recording(suite: str, task: int, image_size: int, frame_stride: int) -> Libe
     Raises:
         InputError: The suite has no expert, or there is no such task.
     """
-    if suite not in EXPERT_SUITES:
-        raise InputError(f"suite: given {suite!r}, expected one with an expert: {', '.join(EXPERT_SUITES)}")
+    if suite not in EXPERTS:
+        raise InputError(f"suite: given {suite!r}, expected one with an expert: {', '.join(EXPERTS)}")
     return LiberoRecording(suite, task, find_task(suite, task).instruction, image_size, frame_stride)
 
 
@@ -56,23 +73,34 @@ def all_tasks(suite: str) -> tuple[int, ...]:
     return tuple(range(SUITES[suite].num_tasks))
 
 
-def start(environment: LiberoEnvironment, task: int, seed: int) -> Scene:
+def scene_of(environment: LiberoEnvironment) -> Scene:
+    """The scene of a task that puts one object into or onto another."""
+    inner = environment.simulation.inner
+    ((_, target, place),) = inner.parsed_problem["goal_state"]
+    return Scene(inner, target, place.removesuffix("_contain_region"))
+
+
+def start(environment: LiberoEnvironment, settings: LiberoRecording, seed: int) -> Scene:
     """Starts an episode with objects at wider places, and waits until they have come to rest.
+
+    An object on another one moves with it, and one on furniture stays.
 
     Args:
         environment: One without official states and without steps for settling.
-        task: Number of the task.
+        settings: Of the task.
         seed: Of the layout.
     """
     environment.restart(None, seed)
-    inner = environment.simulation.inner
-    _, target, _ = inner.parsed_problem["goal_state"][0]
-    scene = Scene(inner, target, GOAL)
-    names = scene.names()
-    found = {name: scene.position(name)[:2] for name in names}
-    radii = {name: 0.5 * float(np.linalg.norm(np.ptp(scene.points(name)[:, :2], axis=0))) for name in names}
-    for name, place in wider(np.random.default_rng((task, seed)), found, radii, GOAL).items():
-        scene.move(name, place - found[name])
+    scene = scene_of(environment)
+    carriers = scene.carriers()
+    alone = [name for name, carrier in carriers.items() if carrier == name]
+    found = {name: scene.position(name)[:2] for name in alone}
+    radii = {name: 0.5 * float(np.linalg.norm(np.ptp(scene.points(name)[:, :2], axis=0))) for name in alone}
+    rng = np.random.default_rng((settings.task, seed))
+    places = wider(rng, found, radii, scene.goal, EXPERTS[settings.suite].trade_share)
+    for name, carrier in carriers.items():
+        if carrier in places:
+            scene.move(name, places[carrier] - found[carrier])
     for _ in range(SETTLE_STEPS):
         environment.advance([0, 0, 0, 0, 0, 0, -1])
     return scene
@@ -82,14 +110,14 @@ def record_episode(
     environment: LiberoEnvironment, settings: LiberoRecording, seed: int
 ) -> demos.Demonstration | None:
     """Records one episode of the expert; None if it did not succeed. For ``environment`` see ``start``."""
-    scene = start(environment, settings.task, seed)
+    scene = start(environment, settings, seed)
 
     def look() -> demos.Look:
         seen = environment.observe()
         return np.stack([seen["images"][name] for name in CAMERAS]), seen["state"], scene.targets()
 
     return demos.demonstrated(
-        BasketExpert(scene).action,
+        Expert(scene, EXPERTS[settings.suite].manner).action,
         environment.advance,
         look,
         NoiseBursts(np.random.default_rng((settings.task, seed, 1)), **BURSTS),

@@ -1,4 +1,4 @@
-"""A scripted expert that puts an object into a basket, from the full state of the simulation; NumPy only.
+"""A scripted expert that puts an object somewhere, from the full state of the simulation; NumPy only.
 
 It moves the hand above the object, down, closes the gripper, lifts, carries, lowers, opens and retreats, with
 the actions of LIBERO's controller. If it loses the object, it begins again.
@@ -6,6 +6,7 @@ the actions of LIBERO's controller. If it loses the object, it begins again.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -13,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from saccade._internal.arrays import Float32Array
-from saccade_lab.libero.grasps import Grasp, Points, fingertip_height, plan_grasp
+from saccade_lab.libero.grasps import Grasp, Points, fingertip_height, plan_grasp, plan_rim_grasp
 
 Vector = npt.NDArray[np.float64]
 
@@ -21,8 +22,7 @@ OPEN, CLOSE = -1.0, 1.0  # the last number of an action
 GAIN = 20.0  # of an action for each metre that is missing; the controller moves 5 cm for an action of 1
 TURN_GAIN = 2.0  # of an action for each radian; 0.5 radians for an action of 1
 ABOVE = 0.08  # metres between the hand and the top of the object before it goes down
-OVER_RIM = 0.05  # metres between what it carries and the rim of the basket
-BELOW_RIM = 0.03  # metres that the object's lowest point is below the rim when it is let go
+OVER_RIM = 0.05  # metres between what it carries and the highest point of the goal
 LOST = 0.15  # metres between the hand and the object that it should hold
 RISE = np.array([0, 0, 0.02])  # metres, when it has lost the object
 RETREAT = np.array([0, 0, 0.12])  # metres, after it has let go
@@ -49,7 +49,7 @@ class Situation:
         rotation: ``(3, 3)``, the axes of the hand as columns.
         body: ``(3,)``, the origin of the target.
         target: ``(n, 3)``, points that span the target.
-        goal: ``(m, 3)``, points that span the basket.
+        goal: ``(m, 3)``, points that span what the target is put into or onto.
     """
 
     hand: Vector
@@ -70,19 +70,52 @@ class World(Protocol):
         """The ground plan ``(m, 2)`` of the other objects that are higher than ``above``, metres."""
         ...
 
+    def obstacles(self) -> Points:
+        """Points ``(m, 3)`` of the other objects and of the furniture, metres."""
+        ...
 
-class BasketExpert:
+
+@dataclass(frozen=True)
+class Manner:
+    """How an object is taken, and where it is let go.
+
+    Attributes:
+        grasp: Plans how it is taken.
+        release: Metres from the highest point of the goal up to the lowest one of the object when it is let
+            go.
+    """
+
+    grasp: Callable[[Situation, World], Grasp]
+    release: float
+
+
+def grasp_middle(seen: Situation, world: World) -> Grasp:
+    """Takes an object that is narrower than the gripper opens."""
+    return plan_grasp(seen.target, world.neighbours(fingertip_height(seen.target) - 0.005))
+
+
+def grasp_rim(seen: Situation, world: World) -> Grasp:
+    """Takes a bowl."""
+    return plan_rim_grasp(seen.target, world.obstacles(), seen.hand)
+
+
+INTO_BASKET = Manner(grasp_middle, release=-0.03)
+ONTO_PLATE = Manner(grasp_rim, release=0.004)
+
+
+class Expert:
     """The expert of one episode.
 
     Args:
         world: The simulation that it acts in.
+        manner: How it takes its target and lets go of it.
 
     Attributes:
         phase: What it is doing, a key of ``LIMITS``.
     """
 
-    def __init__(self, world: World) -> None:
-        self._world = world
+    def __init__(self, world: World, manner: Manner) -> None:
+        self._world, self._manner = world, manner
         seen = world.situation()
         self._down = downward(seen.rotation)
         self._hand = seen.hand
@@ -105,8 +138,7 @@ class BasketExpert:
         self.phase, self._steps = phase, 0
 
     def _plan(self, seen: Situation) -> None:
-        above = fingertip_height(seen.target) - 0.005
-        self._grasp: Grasp = plan_grasp(seen.target, self._world.neighbours(above))
+        self._grasp = self._manner.grasp(seen, self._world)
         self._offset = self._grasp.xy - seen.body[:2]  # from the object's origin to the hand
 
     def _move(self, seen: Situation, speed: float, turn: float) -> tuple[Vector, float]:
@@ -156,7 +188,7 @@ class BasketExpert:
                 self._begin("lower")
             return goal, CLOSE
         if self.phase == "lower":
-            low = hand[2] - (float(seen.target[:, 2].min()) - rim) - BELOW_RIM
+            low = hand[2] - (float(seen.target[:, 2].min()) - rim) + self._manner.release
             if hand[2] - low < 0.008 or late:
                 self._held_at = hand
                 self._begin("open")
@@ -165,7 +197,7 @@ class BasketExpert:
             if late:
                 self._begin("retreat")
             return self._held_at, OPEN
-        if late:  # it has let go, and the object is not in the basket
+        if late:  # it has let go, and the task is not done
             self._plan(seen)
             self._begin("above")
         return self._held_at + RETREAT, OPEN

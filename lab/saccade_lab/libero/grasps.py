@@ -1,4 +1,4 @@
-"""Where a parallel gripper that points straight down takes hold of an object; NumPy only."""
+"""Where a parallel gripper that points straight down takes hold of an object, or of its rim; NumPy only."""
 
 from __future__ import annotations
 
@@ -20,6 +20,18 @@ TURN_COST = 0.012  # metres of width that a turn by 90 degrees is worth
 TOO_WIDE_COST = 0.2
 NEIGHBOUR_COST = 3.0
 YAWS = np.radians(np.arange(-90, 90, 5))
+
+# Of a bowl, which is wider than the gripper opens: one finger goes inside.
+SIDES = np.radians(
+    [0, 180, 30, -30, 150, -150, 60, -60, 120, -120, 90, -90]
+)  # where on the rim, from the hand's closing axis at the start
+RIM_BAND = 0.012  # metres below the highest point that belong to the rim
+RIM_INSET = 0.006  # metres from the outside of the rim to the middle of the hand
+RIM_DEPTH = 0.018  # metres that the fingers reach below the rim
+OUTER_FINGER = 0.03  # metres from the outside of the rim to the outer finger
+FREE_ENOUGH = 0.06  # metres around the outer finger beyond which more room is worth nothing
+RIM_TURN_COST = 0.01  # metres of that room that a turn by a radian is worth
+RIM_WAY_COST = 0.02  # the same, for each metre of the hand's way
 
 
 @dataclass(frozen=True)
@@ -72,6 +84,42 @@ def plan_grasp(points: Points, neighbours: Points) -> Grasp:
         best = min(best, (cost, float(yaw), width))
     _, yaw, width = best
     return Grasp(middle, z, yaw, width, top=float(high[2]), hang=z - float(low[2]))
+
+
+def plan_rim_grasp(points: Points, obstacles: Points, hand: npt.NDArray[np.float64]) -> Grasp:
+    """The grasp of the rim of a round object with one finger inside, on the side with the most room.
+
+    Args:
+        points: ``(n, 3)``, points of the object that span its convex hull, metres.
+        obstacles: ``(m, 3)``, points of everything else.
+        hand: ``(3,)``, where the hand is.
+
+    Example:
+        >>> angles = np.radians(np.arange(0, 360, 10))
+        >>> rim = 0.05 * np.stack((np.cos(angles), np.sin(angles)), axis=-1)
+        >>> bowl = np.concatenate([np.insert(rim, 2, height, axis=1) for height in (0, 0.05)])
+        >>> grasp = plan_rim_grasp(bowl, np.array([[0, 0.1, 0.1]]), np.zeros(3))
+        >>> grasp.xy.round(3), round(grasp.z, 3), round(np.degrees(grasp.yaw))  # away from the obstacle
+        (array([-0.   , -0.044]), 0.032, 0)
+    """
+    low, high = points.min(axis=0), points.max(axis=0)
+    middle, top = 0.5 * (low + high)[:2], float(high[2])
+    rim = points[points[:, 2] > top - RIM_BAND, :2]
+    radius = float(np.linalg.norm(rim - middle, axis=1).max())
+    beside = obstacles[obstacles[:, 2] > top - RIM_DEPTH, :2]
+    best = (np.inf, 0.0, 0.0)
+    for side in SIDES:
+        outward = np.array([-np.sin(side), np.cos(side)])
+        yaw = side if abs(side) <= np.pi / 2 else side - np.sign(side) * np.pi
+        finger = middle + (radius + OUTER_FINGER) * outward
+        room = min((float(np.linalg.norm(one - finger)) for one in beside), default=FREE_ENOUGH)
+        way = float(np.linalg.norm(middle + (radius - RIM_INSET) * outward - hand[:2]))
+        cost = RIM_TURN_COST * abs(yaw) + RIM_WAY_COST * way - min(room, FREE_ENOUGH)
+        best = min(best, (cost, float(side), float(yaw)))
+    _, side, yaw = best
+    xy = middle + (radius - RIM_INSET) * np.array([-np.sin(side), np.cos(side)])
+    z = top - RIM_DEPTH
+    return Grasp(xy, z, yaw, width=2 * RIM_INSET, top=top, hang=z - float(low[2]))
 
 
 def fingertip_height(points: Points) -> float:

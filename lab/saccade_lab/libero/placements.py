@@ -22,7 +22,11 @@ Positions = Mapping[str, npt.NDArray[np.float64]]
 
 
 def wider(
-    rng: np.random.Generator, found: Positions, radii: Mapping[str, float], fixed: str
+    rng: np.random.Generator,
+    found: Positions,
+    radii: Mapping[str, float],
+    fixed: str,
+    trade_share: float = TRADE_SHARE,
 ) -> dict[str, npt.NDArray[np.float64]]:
     """Positions of objects that differ more than those of LIBERO's own reset.
 
@@ -31,6 +35,7 @@ def wider(
         found: ``(2,)`` of each object after the reset, metres.
         radii: Of a circle around each object in the ground plan, metres.
         fixed: The object that does not trade places, the basket. It is shifted like the others.
+        trade_share: Share of the placements in which objects trade places.
 
     Returns:
         The new positions of the objects within reach. If there is no room after many attempts, those that
@@ -45,7 +50,7 @@ def wider(
     near = {name: place for name, place in found.items() if np.abs(place).max() < REACH}
     movable = [name for name in near if name != fixed]
     for attempt in range(ATTEMPTS):
-        trades = rng.random() < TRADE_SHARE
+        trades = rng.random() < trade_share
         order = rng.permutation(len(movable)) if trades else np.arange(len(movable))
         places = {name: near[movable[other]] for name, other in zip(movable, order, strict=True)}
         if fixed in near:

@@ -35,6 +35,8 @@ class Scene:
         bodies: Mapping[str, int] = simulation.obj_body_id
         self._bodies = {name: bodies[name] for name in simulation.objects_dict}
         self._local = {name: self._shape(body) for name, body in self._bodies.items()}
+        furniture = [name for name in simulation.fixtures_dict if name in bodies]
+        self._furniture = {name: self._geoms(bodies[name]) for name in furniture}
         self._hand = simulation.robots[0].eef_site_id
 
     def names(self) -> list[str]:
@@ -74,24 +76,47 @@ class Scene:
         high = [filled(shape)[:, :2] for shape in shapes if shape[:, 2].max() > above]
         return np.concatenate(high) if high else np.zeros((0, 2))
 
+    def obstacles(self) -> Points:
+        """See ``World``."""
+        shapes = [self.points(name) for name in self._bodies if name != self.target]
+        shapes += [self._geom(geom) for geoms in self._furniture.values() for geom in geoms]
+        return np.concatenate([np.zeros((0, 3)), *map(filled, shapes)])
+
+    def carriers(self) -> dict[str, str | None]:
+        """What each object moves with: itself, the object that it stands on, or None for furniture."""
+        carriers: dict[str, str | None] = {name: name for name in self._bodies}
+        for _, name, place in self._simulation.parsed_problem["initial_state"]:
+            if name not in carriers:
+                continue
+            if place in self._bodies:
+                carriers[name] = place
+            elif any(place.startswith(one) for one in self._furniture):
+                carriers[name] = None
+        return carriers
+
     def targets(self) -> npt.NDArray[np.float32]:
         """Positions of target and goal, ``(6,)``, metres."""
         return np.concatenate((self.position(self.target), self.position(self.goal))).astype(np.float32)
 
     def _shape(self, root: int) -> Points:
         """Points of the colliding shapes of a body and of those fixed to it, in its frame."""
+        turn = self._data.xmat[root].reshape(3, 3)
+        return np.concatenate(
+            [(self._geom(geom) - self._data.xpos[root]) @ turn for geom in self._geoms(root)]
+        )
+
+    def _geoms(self, root: int) -> list[int]:
+        """The colliding geoms of a body and of those fixed to it."""
         model, inside = self._model, {root}
         for body in range(root + 1, model.nbody):
             if model.body_parentid[body] in inside:
                 inside.add(body)
-        turn = self._data.xmat[root].reshape(3, 3)
-        found = [
-            (self._geom(geom) - self._data.xpos[root]) @ turn
+        return [
+            geom
             for geom in range(model.ngeom)
             if model.geom_bodyid[geom] in inside
             and (model.geom_contype[geom] or model.geom_conaffinity[geom])
         ]
-        return np.concatenate(found)
 
     def _geom(self, geom: int) -> Points:
         """Points that span a geom, in the frame of the world."""

@@ -2,12 +2,22 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from saccade._internal.arrays import Float32Array
-from saccade_lab.libero.expert import LIMITS, BasketExpert, Situation, downward, rotation_vector
+from saccade_lab.libero.expert import (
+    INTO_BASKET,
+    LIMITS,
+    ONTO_PLATE,
+    Expert,
+    Situation,
+    downward,
+    rotation_vector,
+)
 from saccade_lab.libero.grasps import Points
 from tests.helpers.paths import ROOT
 
@@ -36,6 +46,9 @@ class Toy:
     def neighbours(self, above: float) -> Points:
         return np.zeros((0, 2))
 
+    def obstacles(self) -> Points:
+        return np.zeros((0, 3))
+
     def step(self, action: Float32Array) -> None:
         assert action.shape == (7,)
         assert action.dtype == np.float32
@@ -43,9 +56,8 @@ class Toy:
         shift = 0.3 * STEP * action[:3].astype(float)
         self.turned = Rotation.from_rotvec(0.3 * TURN * action[3:6]).as_matrix() @ self.turned
         closed = action[6] > 0
-        near = np.abs(self.hand - self.body)
         if closed and not self.held:
-            self.held = bool((near < [0.03, 0.03, 0.06]).all())
+            self.held = self.is_near()
         self.held = self.held and closed
         if self.held and self.hand[1] > 0.1 and self.slips:
             self.slips -= 1
@@ -57,15 +69,57 @@ class Toy:
         if not self.held:
             self.body[2] = 0.05
 
+    def is_near(self) -> bool:
+        return bool((np.abs(self.hand - self.body) < [0.03, 0.03, 0.06]).all())
+
     def solved(self) -> bool:
         return bool((np.abs(self.body - self.basket)[:2] < 0.05).all()) and not self.held
+
+
+class ToyBowl(Toy):
+    """A bowl that is wider than the gripper opens, and a plate."""
+
+    def __init__(self, at: tuple[float, float]) -> None:
+        super().__init__(at)
+        self.let_go = np.inf  # height above the plate
+
+    def situation(self) -> Situation:
+        seen = super().situation()
+        plate = self.basket * [1, 1, 0] + BOX * [0.14, 0.14, 0.02] + [0, 0, 0.01]
+        angles = np.linspace(0, 2 * np.pi, 24)
+        circle = 0.05 * np.stack((np.cos(angles), np.sin(angles)), axis=-1)
+        bowl = np.concatenate([np.insert(circle, 2, z, axis=1) for z in (-0.025, 0.025)])
+        return replace(seen, target=self.body + bowl, goal=plate)
+
+    def step(self, action: Float32Array) -> None:
+        was_held, lowest = self.held, self.body[2] - 0.025
+        super().step(action)
+        if was_held and not self.held:
+            self.let_go = lowest - 0.02
+
+    def is_near(self) -> bool:
+        away = np.abs(self.hand - self.body)
+        rim = away[:2].max()
+        return bool(0.03 < rim < 0.06 and away[2] < 0.03)
+
+
+@pytest.mark.parametrize("at", [(-0.12, -0.24), (0.15, 0.03)])
+def test_it_puts_the_bowl_onto_the_plate(at: tuple[float, float]) -> None:
+    world = ToyBowl(at)
+    expert = Expert(world, ONTO_PLATE)
+    for _ in range(300):
+        world.step(expert.action())
+        if expert.phase == "retreat":
+            break
+    assert world.solved()
+    assert 0 < world.let_go < 0.015  # metres
 
 
 @pytest.mark.parametrize("at", [(-0.12, -0.24), (0.15, 0.03), (-0.2, -0.1)])
 @pytest.mark.parametrize("slips", [0, 1])
 def test_it_puts_the_box_into_the_basket(at: tuple[float, float], slips: int) -> None:
     world = Toy(at, slips)
-    expert = BasketExpert(world)
+    expert = Expert(world, INTO_BASKET)
     phases = [expert.phase]
     for _ in range(400):
         world.step(expert.action())
@@ -96,11 +150,14 @@ class Recorded:
         self.plans += 1
         return np.asarray(self.arrays["neighbours"][self.plans - 1])
 
+    def obstacles(self) -> Points:
+        raise AssertionError("only bowls are taken by their rim")
+
 
 def test_in_a_recorded_episode_it_does_what_solved_the_task() -> None:
     """The first attempt failed, so the episode has each phase, some of them twice."""
     recorded = Recorded()
-    expert = BasketExpert(recorded)
+    expert = Expert(recorded, INTO_BASKET)
     for action, phase in zip(recorded.arrays["actions"], recorded.arrays["phases"], strict=True):
         np.testing.assert_allclose(expert.action(), action, atol=1e-6)
         assert expert.phase == phase
@@ -109,7 +166,7 @@ def test_in_a_recorded_episode_it_does_what_solved_the_task() -> None:
 
 def test_it_begins_again_if_the_box_falls_over() -> None:
     world = Toy((0.0, -0.1))
-    expert = BasketExpert(world)
+    expert = Expert(world, INTO_BASKET)
     while expert.phase != "down":
         world.step(expert.action())
     world.size = np.array([0.1, 0.08, 0.04])
@@ -120,7 +177,7 @@ def test_it_begins_again_if_the_box_falls_over() -> None:
 
 def test_a_phase_ends_after_its_limit() -> None:
     world = Toy((0.0, -0.1))
-    expert = BasketExpert(world)
+    expert = Expert(world, INTO_BASKET)
     for _ in range(LIMITS["above"]):  # the hand does not move
         expert.action()
     assert expert.phase == "above"

@@ -12,10 +12,13 @@ from saccade_lab.libero.grasps import (
     FINGER_CLEARANCE,
     FINGER_REACH,
     MAX_WIDTH,
+    OUTER_FINGER,
+    RIM_INSET,
     YAWS,
     Points,
     finger_clearance,
     plan_grasp,
+    plan_rim_grasp,
 )
 
 NOBODY = np.zeros((0, 2))
@@ -84,3 +87,42 @@ def test_the_distance_of_a_finger_is_that_of_its_box() -> None:
         expected = min(max(abs(along - side) - 0.012, abs(across) - 0.014) for side in (-0.045, 0.045))
         assert finger_clearance(point[None], about_z(yaw)[:2, 1]) == pytest.approx(expected)
     assert finger_clearance(NOBODY, np.array([0.0, 1.0])) == np.inf
+
+
+HAND = np.array([0.3, -0.2, 0.4])  # above the bowl
+
+
+def bowl(radius: float = 0.053, height: float = 0.05) -> Points:
+    """A cone whose rim is wider than the gripper opens."""
+    angles = np.linspace(0, 2 * np.pi, 48, endpoint=False)
+    circle = np.stack((np.cos(angles), np.sin(angles)), axis=-1)
+    rings = [(radius * share, share * height) for share in np.linspace(0.5, 1, 6)]
+    points = np.concatenate([np.insert(size * circle, 2, z, axis=1) for size, z in rings])
+    return np.asarray(points + np.array([0.3, -0.2, 0.9]))
+
+
+def test_a_bowl_is_wider_than_the_gripper_opens() -> None:
+    assert np.ptp(bowl()[:, 1]) > MAX_WIDTH
+
+
+@pytest.mark.parametrize("blocked", [0, 45, 100, 180, 260, 315])
+def test_one_finger_goes_inside_the_rim_where_there_is_room(blocked: int) -> None:
+    way = np.array([np.cos(np.radians(blocked)), np.sin(np.radians(blocked))])
+    wall = np.append(np.array([0.3, -0.2]) + 0.08 * way, 1.0)[None]
+    grasp = plan_rim_grasp(bowl(), wall, HAND)
+    outward = (grasp.xy - [0.3, -0.2]) / (0.053 - RIM_INSET)
+    assert np.linalg.norm(outward) == pytest.approx(1)  # on the rim
+    closing = about_z(grasp.yaw)[:2, 1]
+    assert abs(closing @ outward) == pytest.approx(1)  # the fingers close across it
+    finger = np.array([0.3, -0.2]) + (0.053 + OUTER_FINGER) * outward
+    assert np.linalg.norm(finger - wall[0, :2]) > 0.06
+    assert abs(grasp.yaw) <= np.pi / 2
+    assert 0.9 < grasp.z < grasp.top
+    assert grasp.hang == pytest.approx(grasp.z - 0.9 - 0.025)
+
+
+def test_what_is_lower_than_the_fingers_is_no_obstacle() -> None:
+    low = np.array([[0.3, -0.1, 0.92]])
+    free = plan_rim_grasp(bowl(), np.zeros((0, 3)), HAND)
+    assert plan_rim_grasp(bowl(), low, HAND).yaw == free.yaw
+    np.testing.assert_array_equal(plan_rim_grasp(bowl(), low, HAND).xy, free.xy)
