@@ -414,7 +414,7 @@ def demo_policy(session: nox.Session) -> None:
 
 @nox.session
 def pictures(session: nox.Session) -> None:
-    """Draw the pictures of README and docs anew, from the bundled policy."""
+    """Draw the pictures of README and docs anew, from the bundled policy and from one of LIBERO."""
     environment = working(session, "rollout")
     out = Path(session.posargs[0] if session.posargs else "out/pictures")
     saccade = environment.program("saccade")
@@ -428,6 +428,11 @@ def pictures(session: nox.Session) -> None:
     )
     environment.run("-m", "benches.pages.pictures", "step")
     shutil.copyfile(out / "look" / "sheet.png", ROOT / "docs" / "images" / "attention.png")
+    policy, frames = ROOT / "studies" / "libero" / "n17", ROOT / "studies" / "libero" / "milk"
+    said = ("--instruction", "pick up the milk and place it in the basket")
+    seen = ("--checkpoint", str(policy), "--frames", str(frames), *said, "--out", str(out / "libero"))
+    session.run(saccade, "attention", *seen, external=True)
+    shutil.copyfile(out / "libero" / "sheet.png", ROOT / "docs" / "images" / "libero-attention.png")
 
 
 @nox.session

@@ -28,8 +28,8 @@ two-goals, stereo-reach, two-stage, fork, touch-yellow, touch-blue.
 saccade.datasets.open read. If the command is interrupted, run it again: with --out it
 continues where it stopped. The files are the same with any number of processes and machines.
 
---env libero_object records LIBERO's tasks 0 to 9 instead, each from wider placements than those
-that LIBERO evaluates on (extra libero).
+--env libero_object or libero_spatial records the tasks 0 to 9 of a suite of LIBERO instead, each
+from wider placements than those that LIBERO evaluates on (extra libero).
 
 examples:
   saccade demos --out out/demos                               the data of the bundled policy

@@ -98,9 +98,9 @@ def start(environment: LiberoEnvironment, settings: LiberoRecording, seed: int) 
     radii = {name: 0.5 * float(np.linalg.norm(np.ptp(scene.points(name)[:, :2], axis=0))) for name in alone}
     rng = np.random.default_rng((settings.task, seed))
     places = wider(rng, found, radii, scene.goal, EXPERTS[settings.suite].trade_share)
-    for name, carrier in carriers.items():
-        if carrier in places:
-            scene.move(name, places[carrier] - found[carrier])
+    for carrier, place in places.items():
+        for name in (name for name, below in carriers.items() if below == carrier):
+            scene.move(name, place - found[carrier])
     for _ in range(SETTLE_STEPS):
         environment.advance([0, 0, 0, 0, 0, 0, -1])
     return scene

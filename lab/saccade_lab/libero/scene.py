@@ -85,9 +85,10 @@ class Scene:
     def carriers(self) -> dict[str, str | None]:
         """What each object moves with: itself, the object that it stands on, or None for furniture."""
         carriers: dict[str, str | None] = {name: name for name in self._bodies}
-        for _, name, place in self._simulation.parsed_problem["initial_state"]:
+        for _, name, *places in self._simulation.parsed_problem["initial_state"]:
             if name not in carriers:
                 continue
+            (place,) = places
             if place in self._bodies:
                 carriers[name] = place
             elif any(place.startswith(one) for one in self._furniture):
