@@ -2,7 +2,7 @@
 
     python -m benches.int4 errors [--small] [--policy DIR]  of actions, by precision and by group of layers
     python -m benches.int4 loop [--policy DIR]              success in closed loop on the same episodes
-    python -m benches.int4 libero FLOAT32 INT4              the same, of runs of `saccade libero`
+    python -m benches.int4 libero FLOAT32 INT4 [...]        the same on LIBERO, of runs of `saccade libero`
     python -m benches.int4 full                             memory, loading and time at N1.5's published size
     python -m benches.int4 calibrate                        how long its calibration takes, and its errors
     python -m benches.int4 report [--write]                 prints the page, or writes docs/results/int4.md
@@ -107,7 +107,7 @@ def main() -> int:
     words = parser.add_subparsers(dest="what", required=True)
     of = {word: words.add_parser(word) for word in (*MEASUREMENTS, "report")}
     of["report"].add_argument("--write", action="store_true", help="write the page")
-    for word in MEASUREMENTS:
+    for word in ("errors", "loop", "full", "calibrate"):
         work = ROOT / "out" / "int4"
         of[word].add_argument("--work", type=Path, default=work, help="recordings and checkpoints")
     for word in ("errors", "loop"):
@@ -125,7 +125,8 @@ def main() -> int:
             MEASURED.unlink(missing_ok=True)
         return status
     before = json.loads(MEASURED.read_text()) if MEASURED.exists() else {}
-    args.work.mkdir(parents=True, exist_ok=True)
+    if "work" in args:
+        args.work.mkdir(parents=True, exist_ok=True)
     MEASURED.parent.mkdir(exist_ok=True)
     measured = {"machine": describe()} | {"measured": MEASUREMENTS[args.what](args)}
     write_json(MEASURED, before | {args.what: measured})

@@ -7,8 +7,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-#: What must be the same in all runs.
-COMMON = ("checkpoint", "protocol", "noise", "saccade", "instruction_set", "packages", "machine")
+#: What must be the same in all runs, beside all options but the precision. Checkpoints may differ: one whose
+#: weights were rounded beforehand is another.
+COMMON = ("protocol", "noise", "saccade", "instruction_set", "packages", "machine", "option_files")
 
 
 def measure(folders: Sequence[Path]) -> dict[str, Any]:
@@ -16,36 +17,46 @@ def measure(folders: Sequence[Path]) -> dict[str, Any]:
 
     Args:
         folders: Directories that `saccade libero --out` wrote: the first of float32, the others of other
-            precisions.
+            precisions or of checkpoints that `saccade quantize` made from that one.
 
     Returns:
-        `checkpoint` and `machine` as the runs say, the name of the `protocol`, `tasks`: the suites, and
-        `success`: by precision of each episode, in the same order.
+        What the first run says, with `success`: by precision, and by the name of another checkpoint, of each
+        episode, in the same order.
 
     Raises:
-        SystemExit: The first run is not of float32, two have the same precision, or runs differ in more.
+        SystemExit: There are not several runs, the first is not of float32, two are the same, they differ in
+            more, or they have no episode in common.
     """
     runs = [json.loads((folder / "results.json").read_text()) for folder in folders]
-    names = [_precision(run) for run in runs]
-    if names[0] != "float32" or len(set(names)) < len(names):
+    first = runs[0]
+    names = [_name(run, first) for run in runs]
+    if len(runs) < 2 or names[0] != "float32" or len(set(names)) < len(names):
         raise SystemExit(f"benches.int4: expected runs of float32 and of others, got {', '.join(names)}")
     for folder, run in zip(folders, runs, strict=True):
-        differing = [name for name in COMMON if run[name] != runs[0][name]]
+        differing = [name for name in COMMON if run[name] != first[name]]
+        differing += [name for name in _options(first) if _options(run).get(name) != _options(first)[name]]
         if differing:
             raise SystemExit(f"benches.int4: {folder}: another {', '.join(differing)} than in {folders[0]}")
     found = [
         {(one["suite"], one["task"], one["trial"]): one["success"] for one in run["episodes"]} for run in runs
     ]
     common = sorted(set.intersection(*map(set, found)))
+    if not common:
+        raise SystemExit("benches.int4: expected runs of the same episodes, got none that all have")
     return {
-        "checkpoint": runs[0]["checkpoint"],
-        "machine": runs[0]["machine"],
-        "protocol": runs[0]["protocol"]["name"],
+        **{name: first[name] for name in ("checkpoint", "machine", "instruction_set", "saccade")},
+        "protocol": {name: first["protocol"][name] for name in ("name", "start")},
         "tasks": sorted({suite for suite, _, _ in common}),
         "success": {name: [one[key] for key in common] for name, one in zip(names, found, strict=True)},
     }
 
 
-def _precision(run: Mapping[str, Any]) -> str:
-    """The precision of a run: that of backbone and head, or both if they differ."""
-    return ", ".join(dict.fromkeys(run["options"]["precision"].values()))
+def _options(run: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: value for name, value in run["options"].items() if name != "precision"}
+
+
+def _name(run: Mapping[str, Any], first: Mapping[str, Any]) -> str:
+    """The precision of backbone and head, both if they differ, and the checkpoint if it is another one."""
+    precision = ", ".join(dict.fromkeys(run["options"]["precision"].values()))
+    is_same = run["checkpoint"]["sha256"] == first["checkpoint"]["sha256"]
+    return precision if is_same else f"{precision}: {run['checkpoint']['name']}"

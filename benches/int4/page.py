@@ -31,8 +31,12 @@ calibration used, an equal number of each task. Differences are in percentage po
 intervals; "no worse" means that the interval contains zero and excludes a loss of 5 points."""
 
 ABOUT_LIBERO = """\
-Checkpoint {sha256} ([how it was trained](../libero.md#train-a-policy)), by `saccade libero --protocol
-{protocol}` on the same official states and noise."""
+Checkpoint {sha256} ([how it was trained](../libero.md#the-policies-of-this-repository)) by `saccade libero
+--protocol {protocol}`, on the same episodes ({start}) with the same noise. A name behind a precision is that
+of a checkpoint that `saccade quantize` made from it."""
+
+RAN_LIBERO = """\
+(`saccade libero`: {cpu}, {instruction_set}, saccade {saccade}; paired by `python -m benches.int4 libero`.)"""
 
 ABOUT_SIZE = """\
 A whole policy of N1.5's published size with random weights, planted outliers and one embodiment, loaded from
@@ -57,12 +61,18 @@ def document(record: Mapping[str, Any]) -> str:
     ]
     for word, section in SECTIONS.items():
         if word in record:
-            parts += [*section(record[word]["measured"]), by(word, record[word]["machine"])]
+            parts += [*section(record[word]["measured"]), by(word, record[word])]
     return "\n\n".join(parts) + "\n"
 
 
-def by(word: str, machine: Mapping[str, Any]) -> str:
+def by(word: str, record: Mapping[str, Any]) -> str:
     """What measured, and on what machine."""
+    if word == "libero":  # by other processes than the one that read their results
+        ran = record["measured"]
+        return RAN_LIBERO.format(
+            cpu=ran["machine"]["cpu"], instruction_set=ran["instruction_set"], saccade=ran["saccade"]
+        )
+    machine = record["machine"]
     where = f"{machine['cpu']} ({machine['family']}, {machine['isa']}), {machine['cores']} cores"
     return f"(`python -m benches.int4 {word}`: {where}; commit {machine['commit']}.)"
 
@@ -99,9 +109,11 @@ def loop_section(measured: Mapping[str, Any]) -> list[str]:
 
 def libero_section(measured: Mapping[str, Any]) -> list[str]:
     """Success on LIBERO."""
-    sha256, protocol = measured["checkpoint"]["sha256"][:16], measured["protocol"]
-    words = ABOUT_LIBERO.format(sha256=sha256, protocol=protocol)
-    return ["## Closed loop on LIBERO", words, loops({measured["checkpoint"]["name"]: measured})]
+    checkpoint, protocol = measured["checkpoint"], measured["protocol"]
+    words = ABOUT_LIBERO.format(
+        sha256=checkpoint["sha256"][:16], protocol=protocol["name"], start=protocol["start"]
+    )
+    return ["## Closed loop on LIBERO", words, loops({checkpoint["name"]: measured})]
 
 
 def full_section(measured: Mapping[str, Any]) -> list[str]:

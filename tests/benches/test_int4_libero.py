@@ -12,7 +12,8 @@ from benches.int4 import libero
 
 ABOUT = {
     "checkpoint": {"name": "n17", "sha256": "c"},
-    "protocol": {"name": "lerobot"},
+    "protocol": {"name": "lerobot", "start": "official states"},
+    "option_files": {},
     "noise": {"seed": 0},
     "saccade": "0.1.0",
     "instruction_set": "avx2",
@@ -21,12 +22,18 @@ ABOUT = {
 }
 
 
-def run(folder: Path, precision: str, episodes: dict[tuple[int, int], bool], **changes: Any) -> Path:
+def run(
+    folder: Path,
+    precision: str,
+    episodes: dict[tuple[int, int], bool],
+    embodiment: str | None = None,
+    **changes: Any,
+) -> Path:
     rows = [
         {"suite": "libero_object", "task": task, "trial": trial, "success": success, "steps": 9}
         for (task, trial), success in episodes.items()
     ]
-    options = {"precision": {"backbone": precision, "head": precision}}
+    options = {"precision": {"backbone": precision, "head": precision}, "embodiment": embodiment}
     folder.mkdir()
     (folder / "results.json").write_text(json.dumps(ABOUT | {"options": options, "episodes": rows} | changes))
     return folder
@@ -38,17 +45,39 @@ def test_episodes_are_paired_by_task_and_trial(tmp_path: Path) -> None:
     found = libero.measure([exact, rounded])
     assert found["success"] == {"float32": [True, False, True], "int4": [True, True, False]}
     assert found["tasks"] == ["libero_object"]
-    assert found["protocol"] == "lerobot"
+    assert found["protocol"] == {"name": "lerobot", "start": "official states"}
+
+
+def test_another_checkpoint_is_named(tmp_path: Path) -> None:
+    exact = run(tmp_path / "a", "float32", {(0, 0): True})
+    plain = run(tmp_path / "b", "int4", {(0, 0): False})
+    rounded = run(tmp_path / "c", "int4", {(0, 0): True}, checkpoint={"name": "n17-int4", "sha256": "d"})
+    found = libero.measure([exact, plain, rounded])
+    assert found["success"] == {"float32": [True], "int4": [False], "int4: n17-int4": [True]}
 
 
 @pytest.mark.parametrize(
-    ("name", "value"), [("checkpoint", {"name": "n17", "sha256": "d"}), ("protocol", {"name": "isaac-n17"})]
+    ("name", "value"),
+    [
+        ("protocol", {"name": "isaac-n17"}),
+        ("option_files", {"x.json": "e"}),
+        ("embodiment", "libero_sim"),
+        ("machine", {"cpu": "another"}),
+    ],
 )
 def test_runs_that_differ_in_more_are_refused(tmp_path: Path, name: str, value: Any) -> None:
     exact = run(tmp_path / "a", "float32", {(0, 0): True})
     rounded = run(tmp_path / "b", "int4", {(0, 0): True}, **{name: value})
     with pytest.raises(SystemExit, match=f"another {name} than in"):
         libero.measure([exact, rounded])
+
+
+@pytest.mark.parametrize("others", [[], [{(1, 0): True}]])
+def test_there_is_something_to_compare(tmp_path: Path, others: list[dict[tuple[int, int], bool]]) -> None:
+    runs = [run(tmp_path / "a", "float32", {(0, 0): True})]
+    runs += [run(tmp_path / "b", "int4", episodes) for episodes in others]
+    with pytest.raises(SystemExit, match="expected runs of"):
+        libero.measure(runs)
 
 
 def test_the_first_run_is_of_float32(tmp_path: Path) -> None:

@@ -51,8 +51,10 @@ def record() -> dict[str, Any]:
         },
         "libero": {
             "checkpoint": {"name": "n17", "sha256": 64 * "c"},
-            "machine": {"cpu": "a CPU"},
-            "protocol": "lerobot",
+            "machine": {"cpu": "another CPU"},
+            "instruction_set": "avx512",
+            "saccade": "0.1.0",
+            "protocol": {"name": "lerobot", "start": "official states"},
             "tasks": ["libero_object"],
             "success": {"float32": [True, True, False], "int4": [True, False, False]},
         },
@@ -86,7 +88,8 @@ def test_the_page() -> None:
     ):
         assert line in lines
     text = " ".join(lines)
-    assert text.count("a CPU (a family, avx2), 2 cores; commit abc") == 5
+    assert text.count("a CPU (a family, avx2), 2 cores; commit abc") == 4
+    assert "another CPU, avx512, saccade 0.1.0" in text
     assert "rounded for 24 observations, and errors are those on 12." in text
     assert "The bundled policy: checkpoint aaaaaaaaaaaaaaaa." in text
     assert (

@@ -25,6 +25,9 @@ from saccade_lab.sim.tasks import DEMONSTRATION_SEEDS
 SEED = DEMONSTRATION_SEEDS.start
 SMALL = demos.recording("libero_object", 6, image_size=32, frame_stride=30)
 
+#: Positions of the object and the basket in the first frame of the first demonstration of that task.
+RECORDED = [-0.100449, -0.2534029, 0.0086955, 0.0335882, 0.236071, -0.0045823]
+
 
 @pytest.fixture(autouse=True)
 def closed() -> Iterator[None]:
@@ -39,7 +42,7 @@ def closed() -> Iterator[None]:
 def test_the_expert_solves_official_starts(suite: str, task: int) -> None:
     environment = LiberoEnvironment(suite, task)
     environment.restart(3, 0)
-    expert = Expert(demos.scene_of(environment), demos.EXPERTS[suite].manner)
+    expert = Expert(demos.scene_of(environment), demos.EXPERTS[suite].technique)
     for _ in range(demos.MAX_STEPS):
         if environment.advance(expert.action()).success:
             break
@@ -92,22 +95,51 @@ def test_starts_are_wider_than_the_official_ones() -> None:
     environment.close()
 
 
-def test_what_stands_on_something_moves_with_it_or_stays() -> None:
-    """A bowl in a drawer, and in another scene one on a box of cookies."""
-    for task, carrier in ((4, None), (3, "cookies_1")):
-        settings = demos.recording("libero_spatial", task, 32, 30)
-        environment = LiberoEnvironment("libero_spatial", task, settle_steps=0, official_states=False)
-        environment.restart(None, SEED)
-        before = demos.scene_of(environment)
-        assert before.carriers()[before.target] == carrier
-        assert before.carriers()["plate_1"] == "plate_1"
-        found = {name: before.position(name) for name in before.names()}
-        scene = demos.start(environment, settings, SEED)
-        moved = {name: (scene.position(name) - found[name])[:2] for name in scene.names()}
-        assert np.abs(moved["plate_1"]).max() > 0.004
-        expected = np.zeros(2) if carrier is None else moved[carrier]
-        np.testing.assert_allclose(moved[scene.target], expected, atol=0.004)  # metres; it has settled
-        environment.close()
+@pytest.mark.parametrize(
+    ("task", "carrier"),
+    [
+        (0, "akita_black_bowl_1"),
+        (2, "akita_black_bowl_1"),
+        (3, "cookies_1"),
+        (4, None),
+        (8, "akita_black_bowl_1"),
+    ],
+)
+def test_what_stands_on_something_moves_with_it_or_stays(task: int, carrier: str | None) -> None:
+    """A bowl on the table, near other things, on a box of cookies, and in a drawer."""
+    settings = demos.recording("libero_spatial", task, 32, 30)
+    environment = LiberoEnvironment("libero_spatial", task, settle_steps=0, official_states=False)
+    environment.restart(None, SEED)
+    before = demos.scene_of(environment)
+    assert before.carriers()[before.target] == carrier
+    assert before.carriers()["plate_1"] == "plate_1"
+    found = {name: before.position(name) for name in before.names()}
+    scene = demos.start(environment, settings, SEED)
+    moved = {name: (scene.position(name) - found[name])[:2] for name in scene.names()}
+    assert np.abs(moved["plate_1"]).max() > 0.004
+    expected = np.zeros(2) if carrier is None else moved[carrier]
+    np.testing.assert_allclose(moved[scene.target], expected, atol=0.004)  # metres; it has settled
+    if carrier is not None:
+        assert np.abs(expected).max() > 0.004
+    environment.close()
+
+
+def test_libero_object_starts_as_in_the_demonstrations_of_the_committed_policies() -> None:
+    environment = LiberoEnvironment("libero_object", 6, settle_steps=0, official_states=False)
+    np.testing.assert_allclose(demos.start(environment, SMALL, SEED).targets(), RECORDED, atol=1e-6)
+    environment.close()
+
+
+def test_furniture_is_an_obstacle_also_between_its_corners() -> None:
+    environment = LiberoEnvironment("libero_spatial", 4, settle_steps=0, official_states=False)
+    environment.restart(None, SEED)
+    scene = demos.scene_of(environment)
+    # The top of the cabinet, where the other bowl stands.
+    bowl = scene.points("akita_black_bowl_2")
+    top = np.append(bowl[:, :2].mean(axis=0), bowl[:, 2].min())
+    scene.move("akita_black_bowl_2", np.array([0.0, 0.5]))
+    assert np.linalg.norm(scene.obstacles() - top, axis=1).min() < 0.02  # metres
+    environment.close()
 
 
 def test_points_span_the_shapes_of_objects() -> None:

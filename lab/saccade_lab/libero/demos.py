@@ -17,7 +17,8 @@ import numpy as np
 from saccade.datasets import Writer
 from saccade.errors import InputError
 from saccade_lab.libero.checkpoint import ACTION_GROUPS, CAMERAS, CONTROL_HZ, STATE_GROUPS, policy_actions
-from saccade_lab.libero.expert import INTO_BASKET, ONTO_PLATE, Expert, Manner
+from saccade_lab.libero.expert import INTO_BASKET, ONTO_PLATE, Expert, Technique
+from saccade_lab.libero.grasps import Points
 from saccade_lab.libero.placements import TRADE_SHARE, wider
 from saccade_lab.libero.recording import LiberoRecording
 from saccade_lab.libero.scene import Scene
@@ -31,26 +32,42 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Expertise:
+class SuiteExpert:
     """How the tasks of a suite are demonstrated, which all put one object somewhere.
 
     Attributes:
-        manner: How the object is taken and let go.
-        trade_share: Share of the demonstrations in which objects trade places. None may where words say where
-            an object stands.
+        technique: How the object is taken and let go.
+        trade_share: Share of the demonstrations in which objects trade places. 0 if instructions say where an
+            object stands.
+        radius: Metres from the middle of an object that others stay away, by its ground plan ``(n, 2)``.
     """
 
-    manner: Manner
+    technique: Technique
     trade_share: float
+    radius: Callable[[Points], float]
 
 
-EXPERTS: Mapping[str, Expertise] = {
-    "libero_object": Expertise(INTO_BASKET, TRADE_SHARE),
-    "libero_spatial": Expertise(ONTO_PLATE, 0.0),
+def half_diagonal(plan: Points) -> float:
+    """Half of the diagonal of the box around a ground plan: more than a circle needs."""
+    return 0.5 * float(np.linalg.norm(np.ptp(plan, axis=0)))
+
+
+def largest_distance(plan: Points) -> float:
+    """The largest distance from the middle of the box around a ground plan."""
+    middle = 0.5 * (plan.min(axis=0) + plan.max(axis=0))
+    return float(np.linalg.norm(plan - middle, axis=1).max())
+
+
+EXPERTS: Mapping[str, SuiteExpert] = {
+    "libero_object": SuiteExpert(INTO_BASKET, TRADE_SHARE, half_diagonal),
+    # Its objects are round and near to each other: with half a diagonal there is no room to move them.
+    "libero_spatial": SuiteExpert(ONTO_PLATE, 0.0, largest_distance),
 }
 DEFAULT_COUNT = 40
 IMAGE_SIZE, FRAME_STRIDE = 256, 5
-MAX_STEPS = 280  # as in evaluations; the expert needs 80 to 210
+MAX_STEPS = (
+    280  # as in evaluations; the expert needs 80 to 210 on libero_object and 78 to 214 on libero_spatial
+)
 SETTLE_STEPS = 10
 ROBOT = "libero_panda"
 #: Milder than Meta-World's, because a step moves the hand further: up to 5 cm instead of 1.
@@ -92,14 +109,21 @@ def start(environment: LiberoEnvironment, settings: LiberoRecording, seed: int) 
     """
     environment.restart(None, seed)
     scene = scene_of(environment)
-    carriers = scene.carriers()
-    alone = [name for name, carrier in carriers.items() if carrier == name]
-    found = {name: scene.position(name)[:2] for name in alone}
-    radii = {name: 0.5 * float(np.linalg.norm(np.ptp(scene.points(name)[:, :2], axis=0))) for name in alone}
+    expert, carriers = EXPERTS[settings.suite], scene.carriers()
+    groups = {
+        carrier: [name for name, below in carriers.items() if below == carrier]
+        for carrier in scene.names()
+        if carriers[carrier] == carrier
+    }
+    found = {carrier: scene.position(carrier)[:2] for carrier in groups}
+    plans = {
+        carrier: np.concatenate([scene.points(name)[:, :2] for name in names])
+        for carrier, names in groups.items()
+    }
+    radii = {carrier: expert.radius(plan) for carrier, plan in plans.items()}
     rng = np.random.default_rng((settings.task, seed))
-    places = wider(rng, found, radii, scene.goal, EXPERTS[settings.suite].trade_share)
-    for carrier, place in places.items():
-        for name in (name for name, below in carriers.items() if below == carrier):
+    for carrier, place in wider(rng, found, radii, scene.goal, expert.trade_share).items():
+        for name in groups[carrier]:
             scene.move(name, place - found[carrier])
     for _ in range(SETTLE_STEPS):
         environment.advance([0, 0, 0, 0, 0, 0, -1])
@@ -117,7 +141,7 @@ def record_episode(
         return np.stack([seen["images"][name] for name in CAMERAS]), seen["state"], scene.targets()
 
     return demos.demonstrated(
-        Expert(scene, EXPERTS[settings.suite].manner).action,
+        Expert(scene, EXPERTS[settings.suite].technique).action,
         environment.advance,
         look,
         NoiseBursts(np.random.default_rng((settings.task, seed, 1)), **BURSTS),

@@ -22,7 +22,7 @@ OPEN, CLOSE = -1.0, 1.0  # the last number of an action
 GAIN = 20.0  # of an action for each metre that is missing; the controller moves 5 cm for an action of 1
 TURN_GAIN = 2.0  # of an action for each radian; 0.5 radians for an action of 1
 ABOVE = 0.08  # metres between the hand and the top of the object before it goes down
-OVER_RIM = 0.05  # metres between what it carries and the highest point of the goal
+OVER_GOAL = 0.05  # metres between what it carries and the highest point of the goal
 LOST = 0.15  # metres between the hand and the object that it should hold
 RISE = np.array([0, 0, 0.02])  # metres, when it has lost the object
 RETREAT = np.array([0, 0, 0.12])  # metres, after it has let go
@@ -76,7 +76,7 @@ class World(Protocol):
 
 
 @dataclass(frozen=True)
-class Manner:
+class Technique:
     """How an object is taken, and where it is let go.
 
     Attributes:
@@ -99,8 +99,8 @@ def grasp_rim(seen: Situation, world: World) -> Grasp:
     return plan_rim_grasp(seen.target, world.obstacles(), seen.hand)
 
 
-INTO_BASKET = Manner(grasp_middle, release=-0.03)
-ONTO_PLATE = Manner(grasp_rim, release=0.004)
+INTO_BASKET = Technique(grasp_middle, release=-0.03)
+ONTO_PLATE = Technique(grasp_rim, release=0.004)
 
 
 class Expert:
@@ -108,14 +108,14 @@ class Expert:
 
     Args:
         world: The simulation that it acts in.
-        manner: How it takes its target and lets go of it.
+        technique: How it takes its target and lets go of it.
 
     Attributes:
         phase: What it is doing, a key of ``LIMITS``.
     """
 
-    def __init__(self, world: World, manner: Manner) -> None:
-        self._world, self._manner = world, manner
+    def __init__(self, world: World, technique: Technique) -> None:
+        self._world, self._technique = world, technique
         seen = world.situation()
         self._down = downward(seen.rotation)
         self._hand = seen.hand
@@ -138,14 +138,14 @@ class Expert:
         self.phase, self._steps = phase, 0
 
     def _plan(self, seen: Situation) -> None:
-        self._grasp = self._manner.grasp(seen, self._world)
+        self._grasp = self._technique.grasp(seen, self._world)
         self._offset = self._grasp.xy - seen.body[:2]  # from the object's origin to the hand
 
     def _move(self, seen: Situation, speed: float, turn: float) -> tuple[Vector, float]:
         """Where the hand should be, ``(3,)``, and what the gripper should do; the phase may change."""
         hand, grasp = seen.hand, self._grasp
-        rim = float(seen.goal[:, 2].max())
-        over = max(rim + grasp.hang + OVER_RIM, grasp.top + ABOVE)
+        summit = float(seen.goal[:, 2].max())
+        over = max(summit + grasp.hang + OVER_GOAL, grasp.top + ABOVE)
         late = self._steps > LIMITS[self.phase]
         if self.phase in ("above", "down") and abs(seen.target[:, 2].max() - grasp.top) > TOPPLED:
             self._plan(seen)
@@ -188,7 +188,7 @@ class Expert:
                 self._begin("lower")
             return goal, CLOSE
         if self.phase == "lower":
-            low = hand[2] - (float(seen.target[:, 2].min()) - rim) + self._manner.release
+            low = hand[2] - (float(seen.target[:, 2].min()) - summit) + self._technique.release
             if hand[2] - low < 0.008 or late:
                 self._held_at = hand
                 self._begin("open")

@@ -28,7 +28,7 @@ SIDES = np.radians(
 RIM_BAND = 0.012  # metres below the highest point that belong to the rim
 RIM_INSET = 0.006  # metres from the outside of the rim to the middle of the hand
 RIM_DEPTH = 0.018  # metres that the fingers reach below the rim
-OUTER_FINGER = 0.03  # metres from the outside of the rim to the outer finger
+OUTER_FINGER = FINGER_REACH - RIM_INSET  # metres from the outside of the rim to the outer finger
 FREE_ENOUGH = 0.06  # metres around the outer finger beyond which more room is worth nothing
 RIM_TURN_COST = 0.01  # metres of that room that a turn by a radian is worth
 RIM_WAY_COST = 0.02  # the same, for each metre of the hand's way
@@ -91,8 +91,8 @@ def plan_rim_grasp(points: Points, obstacles: Points, hand: npt.NDArray[np.float
 
     Args:
         points: ``(n, 3)``, points of the object that span its convex hull, metres.
-        obstacles: ``(m, 3)``, points of everything else.
-        hand: ``(3,)``, where the hand is.
+        obstacles: ``(m, 3)``, points of everything else, metres.
+        hand: ``(3,)``, where the hand is, metres.
 
     Example:
         >>> angles = np.radians(np.arange(0, 360, 10))
@@ -107,19 +107,17 @@ def plan_rim_grasp(points: Points, obstacles: Points, hand: npt.NDArray[np.float
     rim = points[points[:, 2] > top - RIM_BAND, :2]
     radius = float(np.linalg.norm(rim - middle, axis=1).max())
     beside = obstacles[obstacles[:, 2] > top - RIM_DEPTH, :2]
-    best = (np.inf, 0.0, 0.0)
+    best = (np.inf, 0.0, 0.0, 0.0)
     for side in SIDES:
+        yaw = side if -np.pi / 2 <= side < np.pi / 2 else side - np.copysign(np.pi, side)
         outward = np.array([-np.sin(side), np.cos(side)])
-        yaw = side if abs(side) <= np.pi / 2 else side - np.sign(side) * np.pi
-        finger = middle + (radius + OUTER_FINGER) * outward
-        room = min((float(np.linalg.norm(one - finger)) for one in beside), default=FREE_ENOUGH)
-        way = float(np.linalg.norm(middle + (radius - RIM_INSET) * outward - hand[:2]))
-        cost = RIM_TURN_COST * abs(yaw) + RIM_WAY_COST * way - min(room, FREE_ENOUGH)
-        best = min(best, (cost, float(side), float(yaw)))
-    _, side, yaw = best
-    xy = middle + (radius - RIM_INSET) * np.array([-np.sin(side), np.cos(side)])
+        xy, finger = (middle + away * outward for away in (radius - RIM_INSET, radius + OUTER_FINGER))
+        room = np.linalg.norm(beside - finger, axis=1).min(initial=FREE_ENOUGH)
+        way = np.linalg.norm(xy - hand[:2])
+        best = min(best, (RIM_TURN_COST * abs(yaw) + RIM_WAY_COST * way - room, yaw, *xy))
+    _, yaw, *xy = best
     z = top - RIM_DEPTH
-    return Grasp(xy, z, yaw, width=2 * RIM_INSET, top=top, hang=z - float(low[2]))
+    return Grasp(np.array(xy), z, float(yaw), width=2 * RIM_INSET, top=top, hang=z - float(low[2]))
 
 
 def fingertip_height(points: Points) -> float:

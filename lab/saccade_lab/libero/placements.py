@@ -2,7 +2,7 @@
 
 LIBERO's official states move each object by millimetres, and the target of every task of ``libero_object``
 stands in the same place. A policy that is trained on such states need not look. Demonstrations therefore
-begin with all objects moved further, and in some of them they trade places.
+begin with objects moved further, and in some of them they trade places if the instruction allows it.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ def wider(
         rng: Source of randomness.
         found: ``(2,)`` of each object after the reset, metres.
         radii: Of a circle around each object in the ground plan, metres.
-        fixed: The object that does not trade places, the basket. It is shifted like the others.
+        fixed: The object that does not trade places, the goal. It is shifted like the others.
         trade_share: Share of the placements in which objects trade places.
 
     Returns:

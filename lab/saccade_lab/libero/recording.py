@@ -79,7 +79,11 @@ def read_recordings(directory: Path) -> list[LiberoRecording]:
 
 
 def load_samples(
-    directory: Path, recordings: list[LiberoRecording], horizon: int, processor: Processor
+    directory: Path,
+    recordings: list[LiberoRecording],
+    horizon: int,
+    processor: Processor,
+    num_threads: int = 1,
 ) -> tuple[Samples, Samples]:
     """Training and validation samples, split by demonstration, with actions as a policy gives them.
 
@@ -88,12 +92,15 @@ def load_samples(
         recordings: Their tasks; a sample has the number of its task in this list.
         horizon: Actions in a chunk.
         processor: Processor of the policy, which prepares the frames.
+        num_threads: Threads that read and prepare frames.
 
     Raises:
         InputError: A task has no demonstrations.
     """
     names = [task.name for task in recordings]
-    training, validation = dataset.load_samples(directory, names, horizon, processor, range(len(names)))
+    training, validation = dataset.load_samples(
+        directory, names, horizon, processor, range(len(names)), num_threads
+    )
     changed = [
         replace(part, actions=policy_actions(part.actions) * part.mask)
         for part in ([training] if validation is training else [training, validation])

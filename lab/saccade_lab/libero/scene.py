@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping
 from typing import Any
 
@@ -35,8 +36,7 @@ class Scene:
         bodies: Mapping[str, int] = simulation.obj_body_id
         self._bodies = {name: bodies[name] for name in simulation.objects_dict}
         self._local = {name: self._shape(body) for name, body in self._bodies.items()}
-        furniture = [name for name in simulation.fixtures_dict if name in bodies]
-        self._furniture = {name: self._geoms(bodies[name]) for name in furniture}
+        self._furniture = {name: self._geoms(bodies[name]) for name in simulation.fixtures_dict}
         self._hand = simulation.robots[0].eef_site_id
 
     def names(self) -> list[str]:
@@ -78,22 +78,28 @@ class Scene:
 
     def obstacles(self) -> Points:
         """See ``World``."""
-        shapes = [self.points(name) for name in self._bodies if name != self.target]
-        shapes += [self._geom(geom) for geoms in self._furniture.values() for geom in geoms]
-        return np.concatenate([np.zeros((0, 3)), *map(filled, shapes)])
+        shapes = [filled(self.points(name)) for name in self._bodies if name != self.target]
+        for geom in itertools.chain.from_iterable(self._furniture.values()):
+            shapes.append(filled(filled(self._geom(geom))))  # twice: also inside the faces of a box
+        return np.concatenate([np.zeros((0, 3)), *shapes])
 
     def carriers(self) -> dict[str, str | None]:
-        """What each object moves with: itself, the object that it stands on, or None for furniture."""
-        carriers: dict[str, str | None] = {name: name for name in self._bodies}
+        """What each object stands on in the end: itself, another object, or None for furniture."""
+        below: dict[str, str | None] = {}
         for _, name, *places in self._simulation.parsed_problem["initial_state"]:
-            if name not in carriers:
+            if name not in self._bodies:
                 continue
             (place,) = places
             if place in self._bodies:
-                carriers[name] = place
-            elif any(place.startswith(one) for one in self._furniture):
-                carriers[name] = None
-        return carriers
+                below[name] = place
+            elif any(place.startswith(f"{furniture}_") for furniture in self._furniture):
+                below[name] = None
+
+        def lowest(name: str) -> str | None:
+            under = below.get(name, name)
+            return under if under in (None, name) else lowest(under)
+
+        return {name: lowest(name) for name in self._bodies}
 
     def targets(self) -> npt.NDArray[np.float32]:
         """Positions of target and goal, ``(6,)``, metres."""

@@ -6,6 +6,8 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+import torch
+
 from saccade_lab.libero.checkpoint import LiberoConfig, recorded_statistics
 from saccade_lab.libero.recording import describe, load_samples, read_recordings
 from saccade_lab.libero.sizes import libero_config
@@ -41,7 +43,9 @@ def train(
     keep_freed_memory()
     recordings = read_recordings(demonstrations)
     config = libero_config(settings, [task.instruction for task in recordings], recordings[0].image_size)
-    training, validation = load_samples(demonstrations, recordings, settings.horizon, config.processor())
+    training, validation = load_samples(
+        demonstrations, recordings, settings.horizon, config.processor(), torch.get_num_threads()
+    )
     valid = training.mask[..., 0] > 0
     config = replace(config, statistics=recorded_statistics(training.state, training.actions[valid]))
     run = new_run(settings, config, describe(demonstrations, recordings), device)

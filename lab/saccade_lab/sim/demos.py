@@ -410,5 +410,10 @@ def disturbed_column(demonstration: Demonstration) -> dict[str, npt.NDArray[np.i
 
 def episodes(directory: Path, task: str, *, images: bool = True) -> Iterator[tuple[int, Demonstration]]:
     """Seeds and episodes of a task, in the order of their seeds, with or without images as in ``load``."""
-    for path in sorted((directory / task).glob("[0-9]*.npz"), key=lambda path: int(path.stem)):
+    for path in episode_files(directory, task):
         yield int(path.stem), load(path, images=images)
+
+
+def episode_files(directory: Path, task: str) -> list[Path]:
+    """The files of the episodes of a task, in the order of their seeds."""
+    return sorted((directory / task).glob("[0-9]*.npz"), key=lambda path: int(path.stem))

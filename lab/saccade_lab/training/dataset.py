@@ -93,6 +93,7 @@ def load_samples(
     horizon: int,
     processor: Processor | None,
     numbers: Sequence[int] | None = None,
+    num_threads: int = 1,
 ) -> tuple[Samples, Samples]:
     """Training and validation samples, split by demonstration.
 
@@ -103,28 +104,30 @@ def load_samples(
         processor: Processor of the policy, which prepares the frames. None: no frame is read, which saves
             most of the time, and ``images`` is ``(frames, 0, 3, 0, 0)``.
         numbers: The number that samples have of each task. Default: that in ``TASKS``.
+        num_threads: Threads that read and prepare frames.
 
     Raises:
         InputError: A task has no demonstrations.
     """
     parts: tuple[list[Samples], list[Samples]] = ([], [])
-    with ThreadPoolExecutor() as threads:  # preparing frames takes most of the time, and lets others run
+    threads = ThreadPoolExecutor(num_threads)  # reading and preparing frames release Python's lock
+    try:
         for task, number in zip(tasks, numbers or map(list(TASKS).index, tasks), strict=True):
-            episodes = demos.episodes(directory, task, images=processor is not None)
             read = functools.partial(samples_of, task=number, horizon=horizon, processor=processor)
-            found = list(threads.map(read, (demonstration for _, demonstration in episodes)))
+            found = list(threads.map(read, demos.episode_files(directory, task)))
             if not found:
                 raise InputError(f"{directory}: no demonstrations of {task}")
             for place, samples in enumerate(found):
                 parts[place % VALIDATION_EVERY == VALIDATION_EVERY - 1].append(samples)
+    finally:
+        threads.shutdown(cancel_futures=True)
     training = join(parts[0])
     return training, join(parts[1]) if parts[1] else training
 
 
-def samples_of(
-    demonstration: demos.Demonstration, *, task: int, horizon: int, processor: Processor | None
-) -> Samples:
-    """The samples of one demonstration; the arguments are as in ``load_samples``."""
+def samples_of(path: Path, *, task: int, horizon: int, processor: Processor | None) -> Samples:
+    """The samples of the demonstration in a file; the other arguments are as in ``load_samples``."""
+    demonstration = demos.load(path, images=processor is not None)
     actions, mask = chunks(demonstration, horizon)
     keep = mask[..., 0].sum(axis=1) >= MIN_VALID_ACTIONS
     without = np.empty((len(demonstration.images), 0, 3, 0, 0), np.uint8)

@@ -48,8 +48,8 @@ def shifted(images: npt.NDArray[np.uint8], largest: int, rng: np.random.Generato
     edges = (largest, largest)
     wider = np.pad(views, ((0, 0), (0, 0), edges, edges), mode="edge")
     out = np.empty_like(views)
-    for view, (down, right) in enumerate(largest + moves):
-        out[view] = wider[view, :, down : down + height, right : right + width]
+    for view, (top, left) in enumerate(largest + moves):
+        out[view] = wider[view, :, top : top + height, left : left + width]
     return out.reshape(images.shape)
 
 

@@ -11,6 +11,7 @@ continued run gives the same weights as an uninterrupted one.
 # Calls of torch modules are untyped.
 # mypy: disable-error-code="no-untyped-call"
 
+import contextlib
 import io
 import json
 import math
@@ -76,7 +77,7 @@ class Run:
     """A training run in memory.
 
     Attributes:
-        tensors: Those of the policy, as the steps change them.
+        tensors: Those of the policy, in the memory of the learner's, so that they change with every step.
         average: Their averages, which are what is saved.
     """
 
@@ -137,7 +138,7 @@ def new_run(
         betas=BETAS,
         foreach=True,
     )
-    tensors = {name: tensor.detach() for name, tensor in learner.policy_tensors().items()}
+    tensors = learner.policy_tensors()
     average = {name: tensor.clone() for name, tensor in tensors.items()}
     return Run(settings, config, learner, optimizer, tensors, average, demonstrations)
 
@@ -169,7 +170,8 @@ def train_step(run: Run, batch: Batch) -> dict[str, float]:
     # A short memory at first, so that the initial weights do not dominate the average.
     decay = min(settings.ema_decay, (1 + run.step) / (10 + run.step))
     with torch.no_grad():
-        torch._foreach_lerp_(list(run.average.values()), list(run.tensors.values()), 1.0 - decay)
+        averages = [run.average[name] for name in run.tensors]
+        torch._foreach_lerp_(averages, list(run.tensors.values()), 1.0 - decay)
     run.step += 1
     return {name: loss.item() for name, loss in losses.items()}
 
@@ -320,7 +322,11 @@ def train(
     features = {name: features_of(name, settings, recorded, out) for name in (TRAINING, VALIDATION)}
     computed = settings.only == "head" and all(path.exists() for path in features.values())
     training, validation = load_samples(
-        demonstrations, tasks, settings.horizon, None if computed else processor
+        demonstrations,
+        tasks,
+        settings.horizon,
+        None if computed else processor,
+        num_threads=torch.get_num_threads(),
     )
     if settings.blind:
         training, validation = (
@@ -395,17 +401,18 @@ def loop(
     latest: float | None = None
     settings = run.settings
     device = next(run.learner.parameters()).device
-    for batch in drawn(batches, settings.seed, range(run.step, settings.steps), device):
-        steps.append(train_step(run, batch))
-        means = {name: sum(losses[name] for losses in steps) / len(steps) for name in steps[0]}
-        if time.monotonic() - saved > CHECKPOINT_SECONDS or run.step == settings.steps:
-            held_out_losses = validation_losses(run, held_out)
-            validation = {f"validation_{name}": loss for name, loss in held_out_losses.items()}
-            run.history.append({"step": run.step, **means, **validation})
-            save(run, out)
-            latest = held_out_losses["loss"]
-            saved, steps = time.monotonic(), []
-        on_step(Progress(run.step, settings.steps, means["loss"], latest))
+    with contextlib.closing(drawn(batches, settings.seed, range(run.step, settings.steps), device)) as draws:
+        for batch in draws:
+            steps.append(train_step(run, batch))
+            means = {name: sum(losses[name] for losses in steps) / len(steps) for name in steps[0]}
+            if time.monotonic() - saved > CHECKPOINT_SECONDS or run.step == settings.steps:
+                held_out_losses = validation_losses(run, held_out)
+                validation = {f"validation_{name}": loss for name, loss in held_out_losses.items()}
+                run.history.append({"step": run.step, **means, **validation})
+                save(run, out)
+                latest = held_out_losses["loss"]
+                saved, steps = time.monotonic(), []
+            on_step(Progress(run.step, settings.steps, means["loss"], latest))
 
 
 def plot_history(history: list[dict[str, Any]], path: Path) -> None:

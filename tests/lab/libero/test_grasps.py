@@ -116,9 +116,23 @@ def test_one_finger_goes_inside_the_rim_where_there_is_room(blocked: int) -> Non
     assert abs(closing @ outward) == pytest.approx(1)  # the fingers close across it
     finger = np.array([0.3, -0.2]) + (0.053 + OUTER_FINGER) * outward
     assert np.linalg.norm(finger - wall[0, :2]) > 0.06
-    assert abs(grasp.yaw) <= np.pi / 2
+    assert -np.pi / 2 <= grasp.yaw < np.pi / 2
     assert 0.9 < grasp.z < grasp.top
     assert grasp.hang == pytest.approx(grasp.z - 0.9 - 0.025)
+
+
+def test_with_room_on_all_sides_the_hand_turns_least_and_then_takes_the_shortest_way() -> None:
+    free = np.zeros((0, 3))
+    assert plan_rim_grasp(bowl(), free, HAND).yaw == 0
+    for side in (-1, 1):
+        grasp = plan_rim_grasp(bowl(), free, HAND + np.array([0, side * 0.3, 0]))
+        np.testing.assert_allclose(grasp.xy, [0.3, -0.2 + side * (0.053 - RIM_INSET)], atol=1e-12)
+
+
+def test_at_right_angles_the_turn_is_in_its_range() -> None:
+    sides = np.radians(np.delete(np.arange(0, 360, 30), 3))  # all but 90 degrees
+    walls = np.stack((0.3 - 0.09 * np.sin(sides), -0.2 + 0.09 * np.cos(sides), np.ones(11)), axis=-1)
+    assert np.degrees(plan_rim_grasp(bowl(), walls, HAND).yaw) == pytest.approx(-90)
 
 
 def test_what_is_lower_than_the_fingers_is_no_obstacle() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import importlib.util
 import json
 from pathlib import Path
@@ -11,7 +12,9 @@ import pytest
 
 import saccade
 from saccade.cli import main
+from saccade_lab.cli import demos as command
 from saccade_lab.cli.demos import task_numbers
+from saccade_lab.libero.demos import EXPERTS
 from tests.helpers.libero_cases import write_recording
 
 SMALL = [
@@ -84,3 +87,10 @@ def test_the_numbers_of_tasks(tmp_path: Path, capsys: pytest.CaptureFixture[str]
         arguments = ["demos", "--env", "libero_object", f"--tasks={word}", "--out", str(tmp_path)]
         assert main(arguments) != 0
         assert f"--tasks: expected numbers of LIBERO's tasks, got {word}" in capsys.readouterr().err
+
+
+def test_the_suites_that_can_be_recorded_are_those_with_an_expert() -> None:
+    parser = argparse.ArgumentParser()
+    command.add_arguments(parser)
+    (env,) = (action for action in parser._actions if action.dest == "env")
+    assert tuple(env.choices or ()) == tuple(EXPERTS)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import threading
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ from saccade import InputError
 from saccade.backbone.inputs import BackboneInputs
 from saccade_lab.sim.policy import DEMO_CHECKPOINT, Policy
 from saccade_lab.training import train
-from saccade_lab.training.batches import drawn
+from saccade_lab.training.batches import DRAWING_THREADS, drawn
 from saccade_lab.training.learner import Learner
 from saccade_lab.training.settings import TrainingSettings
 from tests.helpers.training_cases import ALIGNED, RECORDING, TASKS, TINY, ignore, make_batches, recorded
@@ -71,6 +72,63 @@ def test_batches_drawn_ahead_are_those_of_their_steps(recording: Path, stop: int
             assert torch.equal(getattr(batch, name), getattr(expected, name)), name
     if stop > 1:
         assert any(not torch.equal(ahead[0].state, other.state) for other in ahead[1:])
+
+
+class Counted:
+    """Draws the numbers of steps, and fails at one of them."""
+
+    def __init__(self, fails_at: int | None = None) -> None:
+        self.drawn: list[int] = []
+        self.fails_at = fails_at
+
+    def draw(self, seed: int, step: int) -> Any:
+        if step == self.fails_at:
+            raise InputError("a frame is missing")
+        self.drawn.append(step)
+        return step
+
+
+def test_what_cannot_be_drawn_ends_the_steps_after_those_before() -> None:
+    batches: Any = Counted(fails_at=7)
+    draws: Any = drawn(batches, 0, range(20), torch.device("meta"))
+    assert [next(draws) for _ in range(7)] == list(range(7))
+    with pytest.raises(InputError, match="a frame is missing"):
+        next(draws)
+
+
+def test_few_batches_are_drawn_ahead_and_none_after_the_end() -> None:
+    batches: Any = Counted()
+    draws: Any = drawn(batches, 0, range(1000), torch.device("meta"))
+    assert [next(draws), next(draws)] == [0, 1]
+    draws.close()
+    assert len(batches.drawn) <= 2 + DRAWING_THREADS
+    assert not any("ThreadPoolExecutor" in thread.name for thread in threading.enumerate())
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+def test_pixels_for_a_gpu_are_page_locked(recording: Path) -> None:
+    run, batches = make_batches(recording, TINY)
+    (batch,) = drawn(batches, run.settings.seed, range(1), torch.device("cuda"))
+    expected = batches.draw(run.settings.seed, 0)
+    for found, same in ((batch.inputs, expected.inputs), (batch.later, expected.later)):
+        assert isinstance(found, BackboneInputs)
+        assert isinstance(same, BackboneInputs)
+        assert torch.from_numpy(found.pixel_values).is_pinned()
+        np.testing.assert_array_equal(found.pixel_values, same.pixel_values)
+
+
+def test_the_followed_tensors_stay_those_of_the_learner(recording: Path, tmp_path: Path) -> None:
+    run, batches = make_batches(recording, TINY, with_later=False)
+    train.train_step(run, batches.draw(TINY.seed, 0))
+    train.validation_losses(run, batches)
+    train.save(run, tmp_path)
+    train.start_from(run, tmp_path)
+    train.resume(run, tmp_path / "training.pt")
+    parameters = dict(run.learner.named_parameters())
+    assert run.tensors.keys() == run.average.keys()
+    for name, tensor in run.tensors.items():
+        assert tensor.data_ptr() == parameters[name].data_ptr(), name
+        assert tensor.data_ptr() != run.average[name].data_ptr(), name
 
 
 def test_training_leaves_a_policy_both_engines_run(recording: Path, tmp_path: Path) -> None:

@@ -210,6 +210,7 @@ class Qwen3VlModel(nn.Module):
         tokens, stacked = self.visual(patches.to(weight), grids)  # (N, width) each
         image_mask = ids == sizes.image_token
         x = with_image_tokens(decoder.embed_tokens(ids), image_mask, tokens)
+        # From the inputs, which are on the CPU: `ids` and `mask` would have to be read back from a GPU.
         given = torch.from_numpy(inputs.input_ids), torch.from_numpy(inputs.attention_mask)
         positions = prompt_positions(*given, grids, sizes).to(ids.device)  # (3, B, T)
         text = sizes.text

@@ -6,9 +6,6 @@ Module names follow the checkpoint. Shapes in comments: P are the patches of all
 # Calls of torch modules are untyped.
 # mypy: disable-error-code="no-any-return, no-untyped-call"
 
-import itertools
-from collections.abc import Iterator, Sequence
-
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
@@ -197,46 +194,49 @@ def prompt_positions(
     Raises:
         InputError: The image tokens of a prompt are not those of its views.
     """
-    if len(set(grids)) > 1:
-        return walked_positions(input_ids, attention_mask, iter(grids), sizes, range(len(input_ids)))
-    # A batch of training says the same few instructions again and again.
-    said = torch.where(attention_mask, input_ids, -1)
-    distinct, which = said.unique(dim=0, return_inverse=True)  # (D, T), (B,)
-    first = [which.tolist().index(number) for number in range(len(distinct))]
-    views = itertools.repeat(grids[0]) if grids else iter(())
-    return walked_positions(input_ids[first], attention_mask[first], views, sizes, first)[:, which]
-
-
-def walked_positions(
-    input_ids: Tensor,
-    attention_mask: Tensor,
-    grids: Iterator[tuple[int, int]],
-    sizes: BackboneSizes,
-    numbers: Sequence[int],
-) -> Tensor:
-    """The positions of prompts whose views have these grids, one after another.
-
-    As ``prompt_positions``; the prompts have ``numbers`` in their batch.
-    """
     positions = torch.ones((3, *input_ids.shape), dtype=torch.long)
+    are_equal = len(set(grids)) == 1
+    # A batch of training repeats few prompts, and a prompt takes a thousand times as long as a copy.
+    known: dict[bytes, tuple[Tensor, int]] = {}
+    used = 0
     for row, (ids, attended) in enumerate(zip(input_ids, attention_mask, strict=True)):
-        places = attended.nonzero()[:, 0]
-        tokens = ids[places].tolist()
-        found: list[tuple[int, int, int]] = []  # of each token: time, height, width
-        number = 0
-        while len(found) < len(tokens):
-            if tokens[len(found)] != sizes.image_token:
-                found.append((number, number, number))
-                number += 1
-                continue
-            height, width = (side // sizes.merge for side in next(grids, (0, 0)))
-            image = tokens[len(found) : len(found) + height * width]
-            if image != [sizes.image_token] * (height * width) or not image:
-                raise InputError(
-                    f"input_ids: expected {height} x {width} image tokens of a view from position "
-                    f"{int(places[len(found)])} of prompt {numbers[row]}"
-                )
-            found += [(number, number + r, number + c) for r in range(height) for c in range(width)]
-            number += max(height, width)
-        positions[:, row, places] = torch.tensor(found, dtype=torch.long).reshape(-1, 3).T
+        key = ids.numpy().tobytes() + attended.numpy().tobytes()
+        found = known.get(key) if are_equal else None
+        if found is None or used + found[1] > len(grids):
+            found = known[key] = row_positions(ids, attended, grids[used:], sizes, row)
+        positions[:, row], used = found[0], used + found[1]
     return positions
+
+
+def row_positions(
+    ids: Tensor, attended: Tensor, grids: list[tuple[int, int]], sizes: BackboneSizes, row: int
+) -> tuple[Tensor, int]:
+    """The positions of one prompt, ``(3, T)``, and the number of its views.
+
+    Args:
+        ids, attended: ``(T,)``, see ``prompt_positions``.
+        grids: Of its views, and of those of later prompts.
+        sizes: Of the backbone.
+        row: The number of the prompt in its batch, for messages.
+    """
+    places = attended.nonzero()[:, 0]
+    tokens = ids[places].tolist()
+    found: list[tuple[int, int, int]] = []  # of each token: time, height, width
+    number, views = 0, 0
+    while len(found) < len(tokens):
+        if tokens[len(found)] != sizes.image_token:
+            found.append((number, number, number))
+            number += 1
+            continue
+        height, width = (side // sizes.merge for side in (grids[views] if views < len(grids) else (0, 0)))
+        image = tokens[len(found) : len(found) + height * width]
+        if image != [sizes.image_token] * (height * width) or not image:
+            raise InputError(
+                f"input_ids: expected {height} x {width} image tokens of a view from position "
+                f"{int(places[len(found)])} of prompt {row}"
+            )
+        found += [(number, number + r, number + c) for r in range(height) for c in range(width)]
+        number, views = number + max(height, width), views + 1
+    positions = torch.ones((3, len(ids)), dtype=torch.long)
+    positions[:, places] = torch.tensor(found, dtype=torch.long).reshape(-1, 3).T
+    return positions, views
