@@ -13,19 +13,19 @@ COMMON = ("protocol", "noise", "saccade", "instruction_set", "packages", "machin
 
 
 def measure(folders: Sequence[Path]) -> dict[str, Any]:
-    """The success of the episodes that all runs have.
+    """The success of the episodes that float32 and another run have, for each other run.
 
     Args:
         folders: Directories that `saccade libero --out` wrote: the first of float32, the others of other
             precisions or of checkpoints that `saccade quantize` made from that one.
 
     Returns:
-        What the first run says, with `success`: by precision, and by the name of another checkpoint, of each
-        episode, in the same order.
+        What the first run says, and `runs` by the name of each other one: its precision, and its checkpoint
+        if that is another. Each has `tasks`, the suites, and `success` of both, episode by episode.
 
     Raises:
         SystemExit: There are not several runs, the first is not of float32, two are the same, they differ in
-            more, or they have no episode in common.
+            more, or one has no episode of the first.
     """
     runs = [json.loads((folder / "results.json").read_text()) for folder in folders]
     first = runs[0]
@@ -37,17 +37,24 @@ def measure(folders: Sequence[Path]) -> dict[str, Any]:
         differing += [name for name in _options(first) if _options(run).get(name) != _options(first)[name]]
         if differing:
             raise SystemExit(f"benches.int4: {folder}: another {', '.join(differing)} than in {folders[0]}")
-    found = [
+    exact, *others = (
         {(one["suite"], one["task"], one["trial"]): one["success"] for one in run["episodes"]} for run in runs
-    ]
-    common = sorted(set.intersection(*map(set, found)))
-    if not common:
-        raise SystemExit("benches.int4: expected runs of the same episodes, got none that all have")
+    )
+    pairs = {}
+    for name, rounded in zip(names[1:], others, strict=True):
+        common = sorted(exact.keys() & rounded.keys())
+        if not common:
+            raise SystemExit(
+                f"benches.int4: expected episodes of {folders[0]}, got none in the run of {name}"
+            )
+        pairs[name] = {
+            "tasks": sorted({suite for suite, _, _ in common}),
+            "success": {"float32": [exact[key] for key in common], name: [rounded[key] for key in common]},
+        }
     return {
         **{name: first[name] for name in ("checkpoint", "machine", "instruction_set", "saccade")},
         "protocol": {name: first["protocol"][name] for name in ("name", "start")},
-        "tasks": sorted({suite for suite, _, _ in common}),
-        "success": {name: [one[key] for key in common] for name, one in zip(names, found, strict=True)},
+        "runs": pairs,
     }
 
 

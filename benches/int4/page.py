@@ -32,8 +32,8 @@ intervals; "no worse" means that the interval contains zero and excludes a loss 
 
 ABOUT_LIBERO = """\
 Checkpoint {sha256} ([how it was trained](../libero.md#the-policies-of-this-repository)) by `saccade libero
---protocol {protocol}`, on the same episodes ({start}) with the same noise. A name behind a precision is that
-of a checkpoint that `saccade quantize` made from it."""
+--protocol {protocol}`, each precision on episodes that float32 ran too ({start}), with the same noise. A name
+behind a precision is that of a checkpoint that `saccade quantize` made from it."""
 
 RAN_LIBERO = """\
 (`saccade libero`: {cpu}, {instruction_set}, saccade {saccade}; paired by `python -m benches.int4 libero`.)"""
@@ -113,7 +113,7 @@ def libero_section(measured: Mapping[str, Any]) -> list[str]:
     words = ABOUT_LIBERO.format(
         sha256=checkpoint["sha256"][:16], protocol=protocol["name"], start=protocol["start"]
     )
-    return ["## Closed loop on LIBERO", words, loops({checkpoint["name"]: measured})]
+    return ["## Closed loop on LIBERO", words, loops(measured["runs"])]
 
 
 def full_section(measured: Mapping[str, Any]) -> list[str]:

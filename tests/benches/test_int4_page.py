@@ -55,8 +55,12 @@ def record() -> dict[str, Any]:
             "instruction_set": "avx512",
             "saccade": "0.1.0",
             "protocol": {"name": "lerobot", "start": "official states"},
-            "tasks": ["libero_object"],
-            "success": {"float32": [True, True, False], "int4": [True, False, False]},
+            "runs": {
+                "int4": {
+                    "tasks": ["libero_object"],
+                    "success": {"float32": [True, True, False], "int4": [True, False, False]},
+                }
+            },
         },
         "full": {
             "size": {
@@ -82,7 +86,7 @@ def test_the_page() -> None:
         "| **a policy**: reach, push | | | |",
         "| float32 | 16 of 161 |  |  |",
         "| int4 | 6 of 161 | -6.2 (-12.4 to -0.5) | worse |",
-        "| **n17**: libero_object | | | |",
+        "| **int4**: libero_object | | | |",
         "| float32 | 2 of 3 |  |  |",
         "| sample | 200 | 180 | 0.90 (0.70 to 0.95) |",
     ):
