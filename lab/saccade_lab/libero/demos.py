@@ -65,9 +65,7 @@ EXPERTS: Mapping[str, SuiteExpert] = {
 }
 DEFAULT_COUNT = 40
 IMAGE_SIZE, FRAME_STRIDE = 256, 5
-MAX_STEPS = (
-    280  # as in evaluations; the expert needs 80 to 210 on libero_object and 78 to 214 on libero_spatial
-)
+MAX_STEPS = 280  # as in evaluations; the expert needs 80 to 210
 SETTLE_STEPS = 10
 ROBOT = "libero_panda"
 #: Milder than Meta-World's, because a step moves the hand further: up to 5 cm instead of 1.

@@ -22,9 +22,8 @@ NEIGHBOUR_COST = 3.0
 YAWS = np.radians(np.arange(-90, 90, 5))
 
 # Of a bowl, which is wider than the gripper opens: one finger goes inside.
-SIDES = np.radians(
-    [0, 180, 30, -30, 150, -150, 60, -60, 120, -120, 90, -90]
-)  # where on the rim, from the hand's closing axis at the start
+# Angles of the places on the rim, from the direction in which the fingers close when the hand is not turned.
+SIDES = np.radians([0, 180, 30, -30, 150, -150, 60, -60, 120, -120, 90, -90])
 RIM_BAND = 0.012  # metres below the highest point that belong to the rim
 RIM_INSET = 0.006  # metres from the outside of the rim to the middle of the hand
 RIM_DEPTH = 0.018  # metres that the fingers reach below the rim
