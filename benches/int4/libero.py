@@ -7,6 +7,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from saccade_lab.files import changed
+
 #: What must be the same in all runs, beside all options but the precision. Checkpoints may differ: one whose
 #: weights were rounded beforehand is another.
 COMMON = ("protocol", "noise", "saccade", "instruction_set", "packages", "machine", "option_files")
@@ -33,9 +35,7 @@ def measure(folders: Sequence[Path]) -> dict[str, Any]:
     if len(runs) < 2 or names[0] != "float32" or len(set(names)) < len(names):
         raise SystemExit(f"benches.int4: expected runs of float32 and of others, got {', '.join(names)}")
     for folder, run in zip(folders, runs, strict=True):
-        differing = [name for name in COMMON if run[name] != first[name]]
-        differing += [name for name in _options(first) if _options(run).get(name) != _options(first)[name]]
-        if differing:
+        if differing := changed(_settings(first), _settings(run)):
             raise SystemExit(f"benches.int4: {folder}: another {', '.join(differing)} than in {folders[0]}")
     exact, *others = (
         {(one["suite"], one["task"], one["trial"]): one["success"] for one in run["episodes"]} for run in runs
@@ -58,8 +58,10 @@ def measure(folders: Sequence[Path]) -> dict[str, Any]:
     }
 
 
-def _options(run: Mapping[str, Any]) -> dict[str, Any]:
-    return {name: value for name, value in run["options"].items() if name != "precision"}
+def _settings(run: Mapping[str, Any]) -> dict[str, Any]:
+    """What must be the same in all runs."""
+    options = {name: value for name, value in run["options"].items() if name != "precision"}
+    return options | {name: run[name] for name in COMMON}
 
 
 def _name(run: Mapping[str, Any], first: Mapping[str, Any]) -> str:

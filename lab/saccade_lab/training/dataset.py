@@ -110,8 +110,7 @@ def load_samples(
         InputError: A task has no demonstrations.
     """
     parts: tuple[list[Samples], list[Samples]] = ([], [])
-    threads = ThreadPoolExecutor(num_threads)  # reading and preparing frames release Python's lock
-    try:
+    with ThreadPoolExecutor(num_threads) as threads:  # reading and preparing frames release Python's lock
         for task, number in zip(tasks, numbers or map(list(TASKS).index, tasks), strict=True):
             read = functools.partial(samples_of, task=number, horizon=horizon, processor=processor)
             found = list(threads.map(read, demos.episode_files(directory, task)))
@@ -119,8 +118,6 @@ def load_samples(
                 raise InputError(f"{directory}: no demonstrations of {task}")
             for place, samples in enumerate(found):
                 parts[place % VALIDATION_EVERY == VALIDATION_EVERY - 1].append(samples)
-    finally:
-        threads.shutdown(cancel_futures=True)
     training = join(parts[0])
     return training, join(parts[1]) if parts[1] else training
 
