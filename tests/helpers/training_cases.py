@@ -51,17 +51,18 @@ def recorded() -> Path:
 
 
 def make_batches(
-    recording: Path, settings: TrainingSettings, *, with_later: bool = True
+    recording: Path, settings: TrainingSettings, *, with_later: bool = True, device: str = "cpu"
 ) -> tuple[train.Run, Batches]:
     """A run before its first step, and what it draws from."""
     config = train.policy_config(settings, RECORDING, TASKS)
     samples, _ = load_samples(recording, TASKS, settings.horizon, config.processor())
     config = train.with_statistics(config, samples)
-    run = train.new_run(settings, config, describe(recording, TASKS))
+    run = train.new_run(settings, config, describe(recording, TASKS), device)
     targets = samples.targets.mean(axis=0), samples.targets.std(axis=0) + np.float32(1e-3)
     batches = Batches(
         samples,
         config,
+        run.learner.backbone,
         prompts_of(config, config.processor()),
         targets,
         settings.batch_size,

@@ -45,3 +45,8 @@ def as_embodiment(
     if ids.numel() and not 0 <= int(ids.min()) <= int(ids.max()) < num_embodiments:
         raise InputError(f"embodiment_id: {ids.tolist()}, expected 0 to {num_embodiments - 1}")
     return int(ids) if ids.ndim == 0 else ids.to(dtype=torch.long, device=device)
+
+
+def can_be_read(tensor: Tensor) -> bool:
+    """Whether the values of a tensor can be looked at: not while they are recorded as a CUDA graph."""
+    return not (tensor.is_cuda and torch.cuda.is_current_stream_capturing())

@@ -20,7 +20,7 @@ from saccade.errors import InputError
 from saccade.head.config import HeadConfig
 from saccade.head.intervention import ROW_GROUPS, Chosen, Intervention, Tokens, as_interventions
 from saccade.head.trace import check_record
-from saccade_lab.reference.checks import check_indices, check_shape
+from saccade_lab.reference.checks import can_be_read, check_indices, check_shape
 
 Mask: TypeAlias = "Tensor | np.ndarray | None"
 
@@ -416,13 +416,13 @@ def forbidden_tokens(
     Raises:
         DtypeError, ShapeError: A mask has the wrong dtype or shape.
         InputError: Padding is given to a head that ignores it, a mask is missing, or a block has no token to
-            attend to in an observation.
+            attend to in an observation. While a CUDA graph is recorded, only what needs no values is checked.
     """
     removed = token_mask("drop_vl", drop_vl, tokens)
     attended = token_mask("attention_mask", attention_mask, tokens)
     image = token_mask("image_mask", image_mask, tokens)
     if config.mask_mode == "none":
-        if attended is not None and not attended.all():
+        if attended is not None and can_be_read(attended) and not attended.all():
             raise InputError(
                 "attention_mask: expected all true, because the released head ignores padding, got a false "
                 "entry; drop_vl removes tokens"
@@ -443,7 +443,7 @@ def forbidden_tokens(
             continue
         kind, chosen = ("image", image) if reads_images(config, block) else ("text", ~image)
         read = permitted & chosen  # (B, S)
-        if not read.any(dim=1).all():
+        if can_be_read(read) and not read.any(dim=1).all():
             row = int(read.any(dim=1).int().argmin())
             raise InputError(
                 f"image_mask: observation {row} has no {kind} token that block {block} can attend to"
@@ -459,10 +459,13 @@ def token_mask(name: str, given: Mask, tokens: Tensor) -> Tensor | None:
         DtypeError: The mask is not boolean.
         ShapeError: The mask has another shape.
     """
-    array = boolean(name, given.cpu() if isinstance(given, Tensor) else given)
-    if array is None:
-        return None
-    mask = torch.tensor(array, device=tokens.device)
+    if isinstance(given, Tensor) and given.dtype == torch.bool:
+        mask = given.to(tokens.device)
+    else:
+        array = boolean(name, given.cpu() if isinstance(given, Tensor) else given)
+        if array is None:
+            return None
+        mask = torch.tensor(array, device=tokens.device)
     check_shape(name, mask, tuple(tokens.shape[:2]))
     return mask
 

@@ -2,35 +2,31 @@
 
 from __future__ import annotations
 
-import itertools
-from collections import deque
-from collections.abc import Generator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Sequence
 
 import numpy as np
 import numpy.typing as npt
 import torch
 
 from saccade._internal.arrays import Float32Array
-from saccade.backbone.inputs import BackboneInputs
 from saccade.processor import Processor
-from saccade_lab.reference.backbone import BackboneFeatures
+from saccade_lab.reference import Backbone
+from saccade_lab.reference.backbone import BackboneFeatures, PreparedInputs
 from saccade_lab.training.dataset import Samples, normalized_actions
-from saccade_lab.training.frames import backbone_inputs, shifted
 from saccade_lab.training.frozen import FrozenFeatures
+from saccade_lab.training.graphs import map_tensors
+from saccade_lab.training.inputs import prepared_inputs, shifted
 from saccade_lab.training.learner import Batch
 from saccade_lab.training.policy_files import PolicyFiles
 
-#: A batch of 128 frames takes a thread 0.1 to 0.2 s, and a step on an H100 0.1 s.
-DRAWING_THREADS = 4
-
 
 class Batches:
-    """Draws batches.
+    """Draws batches on the device of a backbone, where all frames are kept.
 
     Args:
-        samples: The samples to draw from.
+        samples: The samples to draw from. On a GPU the frames of 400 demonstrations of LIBERO take 2.5 GB.
         config: Config of the policy.
+        backbone: Its backbone.
         prompts: What ``prompts_of`` returns.
         targets: Mean and standard deviation of the positions, ``(6,)`` each.
         batch_size: Frames per batch.
@@ -43,6 +39,7 @@ class Batches:
         self,
         samples: Samples,
         config: PolicyFiles,
+        backbone: Backbone,
         prompts: list[list[npt.NDArray[np.int64]]],
         targets: tuple[Float32Array, Float32Array],
         batch_size: int,
@@ -58,7 +55,8 @@ class Batches:
         self._with_later = with_later
         self._batch_size = batch_size
         self._absent_share, self._language_dropout, self._shift = absent_share, language_dropout, shift
-        self._version = config.backbone_sizes.version
+        self._backbone = backbone
+        self._images = torch.from_numpy(samples.images).to(backbone.device)
         normalizer = config.normalizer
         self._state = np.asarray(normalizer.state(samples.state))
         self._actions = normalized_actions(normalizer, samples.actions) * samples.mask
@@ -85,7 +83,7 @@ class Batches:
         if self._language_dropout:
             for row in np.flatnonzero((rng.random(len(rows)) < self._language_dropout) & ~is_absent):
                 prompts[row] = self._prompts[-1][0]
-        return Batch(
+        batch = Batch(
             inputs=self._inputs(self._samples.now[rows], prompts, rng),
             state=torch.from_numpy(self._state[rows]),
             actions=torch.from_numpy(actions),
@@ -93,60 +91,24 @@ class Batches:
             targets=torch.from_numpy(self._targets[rows]),
             later=self._inputs(later, prompts, rng) if self._with_later else None,
         )
+        moved: Batch = map_tensors(batch, lambda one: one.to(self._backbone.device))
+        return moved
 
     def _inputs(
         self,
         frames: npt.NDArray[np.int64],
         prompts: list[npt.NDArray[np.int64]],
         rng: np.random.Generator,
-    ) -> BackboneInputs | BackboneFeatures:
+    ) -> PreparedInputs | BackboneFeatures:
         if self._frozen is not None:
             return self._frozen(frames)
-        images = self._samples.images[frames]
+        device = self._backbone.device
+        images = self._images[torch.from_numpy(frames).to(device)]
         if self._shift:
-            images = shifted(images, self._shift, rng)
-        return backbone_inputs(images, prompts, self._version)
-
-
-def drawn(batches: Batches, seed: int, steps: range, device: torch.device) -> Generator[Batch]:
-    """The batches of training steps, which are the same for every device.
-
-    On a CPU each is drawn when it is asked for. For another device threads draw the next ones meanwhile: as
-    many as there are threads wait, of 230 MB each with 128 frames of two views of LIBERO.
-
-    Args:
-        batches: Draws them.
-        seed: Seed of the run.
-        steps: Numbers of the steps.
-        device: Where they are used.
-    """
-    if device.type == "cpu":
-        yield from (batches.draw(seed, step) for step in steps)
-        return
-
-    def draw(step: int) -> Batch:
-        batch = batches.draw(seed, step)
-        if device.type == "cuda":
-            pin_pixels(batch)
-        return batch
-
-    threads = ThreadPoolExecutor(DRAWING_THREADS)
-    try:
-        draws = (threads.submit(draw, step) for step in steps)
-        ahead = deque(itertools.islice(draws, DRAWING_THREADS))
-        while ahead:
-            batch = ahead.popleft().result()
-            ahead.extend(itertools.islice(draws, 1))
-            yield batch
-    finally:
-        threads.shutdown(cancel_futures=True)
-
-
-def pin_pixels(batch: Batch) -> None:
-    """Moves the pixels of a batch into page-locked memory, from which a GPU reads several times faster."""
-    for inputs in (batch.inputs, batch.later):
-        if isinstance(inputs, BackboneInputs) and not isinstance(inputs.pixel_values, tuple):
-            inputs.pixel_values = torch.from_numpy(inputs.pixel_values).pin_memory().numpy()
+            views = images.flatten(0, 1)
+            moves = rng.integers(-self._shift, self._shift, endpoint=True, size=(len(views), 2))
+            images = shifted(views, torch.from_numpy(moves).to(device), self._shift).view_as(images)
+        return prepared_inputs(self._backbone, images, prompts)
 
 
 def prompts_of(config: PolicyFiles, processor: Processor) -> list[list[npt.NDArray[np.int64]]]:

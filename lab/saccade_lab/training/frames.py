@@ -7,8 +7,6 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
-from saccade._internal.arrays import Float32Array
-from saccade.backbone.inputs import BackboneInputs
 from saccade.processor import Processor
 
 PIXEL_CENTRE = np.float32(127.5)  # pixels are scaled as (u8 - 127.5) / 127.5
@@ -32,25 +30,6 @@ def prepared(images: npt.NDArray[np.uint8], processor: Processor) -> npt.NDArray
     if processor.version == "n1.7":
         pixels = _joined(pixels)
     return np.asarray(pixels.reshape(*images.shape[:2], *pixels.shape[1:]), np.uint8)
-
-
-def shifted(images: npt.NDArray[np.uint8], largest: int, rng: np.random.Generator) -> npt.NDArray[np.uint8]:
-    """Frames shifted at random, each by its own whole numbers of pixels; edges are repeated.
-
-    Args:
-        images: ``(B, cameras, 3, H, W)``.
-        largest: Pixels by which a frame is shifted at most along each axis.
-        rng: Draws the shifts.
-    """
-    views = images.reshape(-1, *images.shape[2:])
-    moves = rng.integers(-largest, largest, endpoint=True, size=(len(views), 2))
-    height, width = views.shape[2:]
-    edges = (largest, largest)
-    wider = np.pad(views, ((0, 0), (0, 0), edges, edges), mode="edge")
-    out = np.empty_like(views)
-    for view, (top, left) in enumerate(largest + moves):
-        out[view] = wider[view, :, top : top + height, left : left + width]
-    return out.reshape(images.shape)
 
 
 def padded(
@@ -77,45 +56,8 @@ def padded(
     return ids, mask
 
 
-def backbone_inputs(
-    images: npt.NDArray[np.uint8],
-    prompts: Sequence[npt.NDArray[np.int64]],
-    version: str,
-    length: int = 0,
-) -> BackboneInputs:
-    """What a backbone takes.
-
-    Args:
-        images: Frames as ``prepared`` returns them, ``(B, cameras, 3, H, W)``.
-        prompts, length: See ``padded``.
-        version: Release of the backbone.
-    """
-    ids, mask = padded(prompts, length)
-    views = images.reshape(-1, *images.shape[2:])
-    if version != "n1.7":
-        return BackboneInputs(_scaled(views), ids, mask)
-    rows, columns = (side // N17_PATCH for side in views.shape[2:])
-    grid = np.tile(np.array([1, rows, columns]), (len(views), 1))
-    return BackboneInputs(_scaled(_patches(views)), ids, mask, grid)
-
-
-def _scaled(pixels: npt.NDArray[np.uint8]) -> Float32Array:
-    return (pixels.astype(np.float32) - PIXEL_CENTRE) / PIXEL_CENTRE
-
-
-def _patches(views: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
-    """``(V, 3, H, W)`` to N1.7's patches, ``(V * patches, 3 * repeats * patch**2)``, square after square."""
-    count, channels, height, width = views.shape
-    side = N17_PATCH * N17_MERGE
-    squares = views.reshape(
-        count, channels, height // side, N17_MERGE, N17_PATCH, width // side, N17_MERGE, N17_PATCH
-    ).transpose(0, 2, 5, 3, 6, 1, 4, 7)  # (V, squares down, right, patches down, right, 3, y, x)
-    patches = squares.reshape(-1, channels, 1, N17_PATCH**2)
-    return np.repeat(patches, N17_REPEATS, axis=2).reshape(len(patches), -1)
-
-
 def _joined(patches: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
-    """The inverse of ``_patches`` for square views, ``(V, patches, values)`` to ``(V, 3, H, W)``."""
+    """N1.7's patches of square views, ``(V, patches, values)``, as frames, ``(V, 3, H, W)``."""
     side = round(patches.shape[1] ** 0.5) // N17_MERGE  # squares along a view
     once = patches.reshape(*patches.shape[:2], 3, N17_REPEATS, -1)[:, :, :, 0]
     squares = once.reshape(-1, side, side, N17_MERGE, N17_MERGE, 3, N17_PATCH, N17_PATCH)

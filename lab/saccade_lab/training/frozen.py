@@ -13,10 +13,10 @@ import numpy.typing as npt
 import torch
 
 from saccade._internal.files import write_atomically
-from saccade.backbone.inputs import BackboneInputs
-from saccade_lab.reference.backbone import Backbone, BackboneFeatures
+from saccade_lab.reference.backbone import Backbone, BackboneFeatures, PreparedInputs
 from saccade_lab.training.dataset import Samples
-from saccade_lab.training.frames import backbone_inputs, padded
+from saccade_lab.training.frames import padded
+from saccade_lab.training.inputs import prepared_inputs
 
 FRAMES_AT_ONCE = 64
 
@@ -63,13 +63,15 @@ class FrozenFeatures:
                 array[frames] = self._backbone(self._inputs(frames)).backbone_features.cpu().numpy()
             array.flush()
 
-    def _inputs(self, frames: npt.NDArray[np.int64]) -> BackboneInputs:
+    def _inputs(self, frames: npt.NDArray[np.int64]) -> PreparedInputs:
         prompts = [self._prompts[frame] for frame in frames]
-        return backbone_inputs(self._images[frames], prompts, self._backbone.sizes.version, self._length)
+        images = torch.from_numpy(self._images[frames]).to(self._backbone.device)
+        return prepared_inputs(self._backbone, images, prompts, self._length)
 
     def __call__(self, frames: npt.NDArray[np.int64]) -> BackboneFeatures:
         """The features of some frames, as the backbone itself returns them."""
         ids, mask = padded([self._prompts[frame] for frame in frames])
         features = self._features[frames, -ids.shape[1] :].astype(np.float32)
         image_mask = ids == self._backbone.sizes.image_token
-        return BackboneFeatures(*map(torch.from_numpy, (features, mask, image_mask)))
+        places = np.flatnonzero(image_mask)
+        return BackboneFeatures(*map(torch.from_numpy, (features, mask, image_mask, places)))

@@ -13,11 +13,10 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 from torch.func import functional_call
 
-from saccade.backbone.inputs import BackboneInputs
 from saccade.head.config import HeadConfig
 from saccade_lab.backbone_sizes import BackboneSizes
 from saccade_lab.reference import ActionHead, Backbone
-from saccade_lab.reference.backbone import BackboneFeatures
+from saccade_lab.reference.backbone import BackboneFeatures, PreparedInputs
 from saccade_lab.reference.layers import TABLE_STD, CategoryLinear
 from saccade_lab.training.policy_files import PolicyFiles
 from saccade_lab.training.settings import TrainingSettings
@@ -42,12 +41,12 @@ class Batch:
         later: With alignment, the observations after the chunk was executed.
     """
 
-    inputs: BackboneInputs | BackboneFeatures
+    inputs: PreparedInputs | BackboneFeatures
     state: Tensor
     actions: Tensor
     mask: Tensor
     targets: Tensor
-    later: BackboneInputs | BackboneFeatures | None = None
+    later: PreparedInputs | BackboneFeatures | None = None
 
 
 class Learner(nn.Module):
@@ -93,14 +92,19 @@ class Learner(nn.Module):
                 nn.Linear(width, width),
             )
 
+    def noise(self, batch: Batch, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+        """Draws the noise of a batch, ``(B, T, action_dim)``, and the times of its flow, ``(B,)``."""
+        noise = torch.randn(batch.actions.shape, generator=generator)
+        return self.action_head.as_input(noise), self.action_head.sample_time(len(noise), generator)
+
     def losses(
-        self, batch: Batch, generator: torch.Generator, average: Mapping[str, Tensor]
+        self, batch: Batch, noise: Tensor, time: Tensor, average: Mapping[str, Tensor]
     ) -> dict[str, Tensor]:
         """All losses of a batch.
 
         Args:
             batch: The samples.
-            generator: Generator of noise and times.
+            noise, time: As ``noise`` draws them.
             average: The averaged tensors of the policy, whose backbone encodes the later observations.
 
         Returns:
@@ -111,8 +115,6 @@ class Learner(nn.Module):
         features = seen.backbone_features  # (B, S, width)
         if self.only == "backbone":
             return {"loss": F.mse_loss(self.target_head(seen), batch.targets.to(features))}
-        noise = torch.randn(batch.actions.shape, generator=generator)
-        time = self.action_head.sample_time(len(noise), generator)
         with self.watched_rows() as rows:
             flow = self.action_head.loss(
                 features,
@@ -142,13 +144,13 @@ class Learner(nn.Module):
             return {}
         return {"attention_mask": seen.attention_mask, "image_mask": seen.image_mask}
 
-    def seen(self, inputs: BackboneInputs | BackboneFeatures) -> BackboneFeatures:
+    def seen(self, inputs: PreparedInputs | BackboneFeatures) -> BackboneFeatures:
         """The backbone's features of observations, unless that is what is given."""
         return inputs if isinstance(inputs, BackboneFeatures) else self.backbone(inputs)
 
     @torch.no_grad()
     def alignment_targets(
-        self, later: BackboneInputs | BackboneFeatures, average: Mapping[str, Tensor]
+        self, later: PreparedInputs | BackboneFeatures, average: Mapping[str, Tensor]
     ) -> Tensor:
         """The targets of the future rows: what the averaged backbone sees later.
 
@@ -159,7 +161,7 @@ class Learner(nn.Module):
         Returns:
             ``(B, N, width)``: the image tokens, averaged over N runs of neighbours.
         """
-        if isinstance(later, BackboneInputs):
+        if isinstance(later, PreparedInputs):
             prefix = "backbone."
             tensors = {
                 name.removeprefix(prefix): tensor
@@ -251,7 +253,8 @@ class ImageTargets(nn.Module):
 def image_tokens(features: BackboneFeatures) -> Tensor:
     """The features of the image tokens, ``(B, image tokens, width)``."""
     tokens = features.backbone_features
-    return tokens[features.image_mask].unflatten(0, (len(tokens), -1))
+    chosen = tokens.flatten(0, 1).index_select(0, features.image_places)
+    return chosen.unflatten(0, (len(tokens), -1))
 
 
 def pool_tokens(tokens: Tensor, count: int) -> Tensor:

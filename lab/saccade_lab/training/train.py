@@ -11,7 +11,7 @@ continued run gives the same weights as an uninterrupted one.
 # Calls of torch modules are untyped.
 # mypy: disable-error-code="no-untyped-call"
 
-import contextlib
+import functools
 import io
 import json
 import math
@@ -43,9 +43,11 @@ from saccade_lab.sim.settings import (
     vocabulary,
 )
 from saccade_lab.sim.tasks import ACTION_DIM, PROPRIO_DIM, find_task
-from saccade_lab.training.batches import Batches, drawn, prompts_of
+from saccade_lab.training.batches import Batches, prompts_of
 from saccade_lab.training.dataset import Samples, describe, load_samples
 from saccade_lab.training.frozen import FrozenFeatures
+from saccade_lab.training.graphs import CudaGraphs
+from saccade_lab.training.history import plot_history
 from saccade_lab.training.learner import Batch, Learner, new_learner
 from saccade_lab.training.policy_files import PolicyFiles
 from saccade_lab.training.settings import STATE_FILE as STATE_FILE
@@ -79,6 +81,7 @@ class Run:
     Attributes:
         tensors: Those of the policy, in the memory of the learner's, so that they change with every step.
         average: Their averages, which are what is saved.
+        graphs: On a GPU, what repeats ``gradients``.
     """
 
     settings: TrainingSettings
@@ -90,6 +93,7 @@ class Run:
     demonstrations: dict[str, Any]
     step: int = 0
     history: list[dict[str, float]] = field(default_factory=list)
+    graphs: CudaGraphs | None = None
 
 
 def policy_config(
@@ -140,13 +144,30 @@ def new_run(
     )
     tensors = learner.policy_tensors()
     average = {name: tensor.clone() for name, tensor in tensors.items()}
-    return Run(settings, config, learner, optimizer, tensors, average, demonstrations)
+    run = Run(settings, config, learner, optimizer, tensors, average, demonstrations)
+    if learner.backbone.device.type == "cuda":
+        run.graphs = CudaGraphs(functools.partial(gradients, run))
+    return run
 
 
 def learning_rate(settings: TrainingSettings, step: int) -> float:
     """Linear warm-up, then a half cosine to zero."""
     warmup = min(1.0, (step + 1) / WARMUP_STEPS)
     return settings.learning_rate * warmup * 0.5 * (1.0 + math.cos(math.pi * step / settings.steps))
+
+
+def gradients(run: Run, given: tuple[Batch, Tensor, Tensor]) -> dict[str, Tensor]:
+    """The losses by name, of a batch with its noise and times; writes the gradients of their sum."""
+    settings = run.settings
+    losses = run.learner.losses(*given, run.average)
+    weights = {"target_loss": settings.target_weight, "alignment_loss": settings.alignment_weight}
+    total = losses["loss"]
+    for name, weight in weights.items():
+        if name in losses:
+            total = total + weight * losses[name]
+    run.optimizer.zero_grad(set_to_none=False)
+    total.backward()
+    return {name: loss.detach() for name, loss in losses.items()}
 
 
 def train_step(run: Run, batch: Batch) -> dict[str, float]:
@@ -157,14 +178,8 @@ def train_step(run: Run, batch: Batch) -> dict[str, float]:
     generator = torch.Generator().manual_seed(
         int(np.random.default_rng((settings.seed, run.step, 1)).integers(2**63))
     )
-    losses = run.learner.losses(batch, generator, run.average)
-    weights = {"target_loss": settings.target_weight, "alignment_loss": settings.alignment_weight}
-    total = losses["loss"]
-    for name, weight in weights.items():
-        if name in losses:
-            total = total + weight * losses[name]
-    run.optimizer.zero_grad(set_to_none=True)
-    total.backward()
+    given = (batch, *run.learner.noise(batch, generator))
+    losses = gradients(run, given) if run.graphs is None else run.graphs(given)
     torch.nn.utils.clip_grad_norm_(run.learner.parameters(), MAX_GRADIENT_NORM)
     run.optimizer.step()
     # A short memory at first, so that the initial weights do not dominate the average.
@@ -181,7 +196,9 @@ def validation_losses(run: Run, batches: Batches) -> dict[str, float]:
     """The losses of the averaged weights, each time on the same held-out frames and noise."""
     current = {name: tensor.clone() for name, tensor in run.tensors.items()}
     run.learner.load_state_dict(run.average, strict=False)
-    losses = run.learner.losses(batches.draw(0), torch.Generator().manual_seed(0), run.average)
+    batch = batches.draw(0)
+    noise, time = run.learner.noise(batch, torch.Generator().manual_seed(0))
+    losses = run.learner.losses(batch, noise, time, run.average)
     run.learner.load_state_dict(current, strict=False)
     return {name: loss.item() for name, loss in losses.items()}
 
@@ -230,7 +247,7 @@ def resume(run: Run, path: Path) -> None:
     Raises:
         InputError: It was started with other settings or other demonstrations.
     """
-    device = next(run.learner.parameters()).device
+    device = run.learner.backbone.device
     state = torch.load(path, weights_only=True, map_location=device)
     settings = run.settings.to_dict()
     if state["settings"] != settings:
@@ -375,6 +392,7 @@ def fit(
         return Batches(
             samples,
             config,
+            run.learner.backbone,
             prompts,
             targets,
             size,
@@ -400,42 +418,14 @@ def loop(
     saved, steps = time.monotonic(), list[dict[str, float]]()
     latest: float | None = None
     settings = run.settings
-    device = next(run.learner.parameters()).device
-    with contextlib.closing(drawn(batches, settings.seed, range(run.step, settings.steps), device)) as draws:
-        for batch in draws:
-            steps.append(train_step(run, batch))
-            means = {name: sum(losses[name] for losses in steps) / len(steps) for name in steps[0]}
-            if time.monotonic() - saved > CHECKPOINT_SECONDS or run.step == settings.steps:
-                held_out_losses = validation_losses(run, held_out)
-                validation = {f"validation_{name}": loss for name, loss in held_out_losses.items()}
-                run.history.append({"step": run.step, **means, **validation})
-                save(run, out)
-                latest = held_out_losses["loss"]
-                saved, steps = time.monotonic(), []
-            on_step(Progress(run.step, settings.steps, means["loss"], latest))
-
-
-def plot_history(history: list[dict[str, Any]], path: Path) -> None:
-    """Plots the losses over the steps on a logarithmic scale."""
-    import matplotlib
-
-    matplotlib.use("agg")
-    from matplotlib import pyplot
-
-    figure, axes = pyplot.subplots(figsize=(7, 4), layout="constrained")
-    names = {
-        "loss": "velocity, training",
-        "validation_loss": "velocity, held out",
-        "target_loss": "positions, training",
-        "validation_target_loss": "positions, held out",
-        "alignment_loss": "1 - cosine of the future rows, training",
-        "validation_alignment_loss": "1 - cosine of the future rows, held out",
-    }
-    for key, label in names.items():
-        if all(key in entry for entry in history):
-            axes.plot([entry["step"] for entry in history], [entry[key] for entry in history], label=label)
-    axes.set(xlabel="step", ylabel="mean squared error", yscale="log")
-    axes.legend()
-    with write_atomically(path) as temporary:
-        figure.savefig(temporary, dpi=120)
-    pyplot.close(figure)
+    for step in range(run.step, settings.steps):
+        steps.append(train_step(run, batches.draw(settings.seed, step)))
+        means = {name: sum(losses[name] for losses in steps) / len(steps) for name in steps[0]}
+        if time.monotonic() - saved > CHECKPOINT_SECONDS or run.step == settings.steps:
+            held_out_losses = validation_losses(run, held_out)
+            validation = {f"validation_{name}": loss for name, loss in held_out_losses.items()}
+            run.history.append({"step": run.step, **means, **validation})
+            save(run, out)
+            latest = held_out_losses["loss"]
+            saved, steps = time.monotonic(), []
+        on_step(Progress(run.step, settings.steps, means["loss"], latest))

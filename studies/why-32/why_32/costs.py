@@ -61,7 +61,8 @@ def cost(training: TrainingSettings, recording: Recording) -> Cost:
     learner = Learner(config.backbone_sizes, head, training.aligned_block, training.only)
     with torch.no_grad():
         of_backbone = counted(lambda: learner.backbone(inputs))
-        seen = learner.backbone(inputs) if training.only == "head" else inputs
+        prepared = learner.backbone.prepare(inputs)
+        seen = learner.backbone(prepared) if training.only == "head" else prepared
     horizon = head.action_horizon
     batch = Batch(
         seen,
@@ -72,8 +73,10 @@ def cost(training: TrainingSettings, recording: Recording) -> Cost:
         later=None if training.aligned_block is None else seen,
     )
 
+    noise, time = learner.noise(batch, torch.Generator().manual_seed(0))
+
     def train() -> None:
-        losses = learner.losses(batch, torch.Generator().manual_seed(0), learner.policy_tensors())
+        losses = learner.losses(batch, noise, time, learner.policy_tensors())
         sum(losses.values(), torch.zeros(())).backward()
 
     call = Call.of(head, inputs.input_ids.shape[1])

@@ -31,7 +31,7 @@ from saccade_lab.libero.sizes import libero_config
 from saccade_lab.reference import ActionHead, Backbone
 from saccade_lab.sim import demos as sim_demos
 from saccade_lab.training.batches import Batches, prompts_of
-from saccade_lab.training.frames import backbone_inputs
+from saccade_lab.training.inputs import prepared_inputs
 from saccade_lab.training.settings import LIBERO_SETTINGS, released_std
 from saccade_lab.training.train import Progress, new_run
 from tests.helpers.libero_cases import SAID, SIZE, TINY, demonstration, tiny, write_recording
@@ -104,16 +104,19 @@ def test_training_sees_what_the_policy_sees(trained: Path, recording: Path) -> N
     samples, held_out = load_samples(recording, tasks, 16, files.processor())
     assert held_out is samples  # too few episodes to hold one out
     prompts = prompts_of(files, files.processor())
+    backbone = Backbone(files.backbone_sizes)
     shown = np.concatenate([demonstration(seed).images for seed in (0, 1, 10, 11)])
     for row, number in ((0, 0), (len(samples) - 1, 1)):
         assert samples.tasks[row] == number
         now = samples.now[row]
-        found = backbone_inputs(samples.images[now : now + 1], [prompts[number][0]], files.version)
+        images = torch.from_numpy(samples.images[now : now + 1])
+        found = prepared_inputs(backbone, images, [prompts[number][0]])
         seen = policy.processor(list(shown[now]), SAID[number])
-        np.testing.assert_allclose(found.pixel_values, seen.pixel_values, atol=1e-6)
-        np.testing.assert_array_equal(found.input_ids, seen.input_ids)
-        if found.image_grid_thw is not None:
-            np.testing.assert_array_equal(found.image_grid_thw, seen.image_grid_thw)
+        expected = backbone.prepare(seen)
+        np.testing.assert_allclose(found.pixels[0], expected.pixels[0], atol=1e-6)
+        assert found.grids == expected.grids
+        for name in ("input_ids", "attention_mask", "image_places", "positions"):
+            assert torch.equal(getattr(found, name), getattr(expected, name)), name
 
 
 def test_a_data_set_of_the_demonstrations_fits_the_policy(trained: Path, tmp_path: Path) -> None:
@@ -199,9 +202,9 @@ def test_a_padded_prompt_changes_nothing(version: str, recording: Path) -> None:
 
     def loss(chosen: list[int]) -> float:
         numbers = [rows.index(row) for row in chosen]
-        seen = learner.backbone(
-            backbone_inputs(samples.images[samples.now[chosen]], [prompts[n][0] for n in numbers], version)
-        )
+        images = torch.from_numpy(samples.images[samples.now[chosen]])
+        said = [prompts[number][0] for number in numbers]
+        seen = learner.backbone(prepared_inputs(learner.backbone, images, said))
         return float(
             head.loss(
                 seen.backbone_features,
@@ -239,7 +242,8 @@ def test_actions_after_a_disturbance_and_words_of_each_task(recording: Path) -> 
     np.testing.assert_array_equal(samples.actions[0, :10, 6], 1)  # open
     np.testing.assert_array_equal(samples.actions[0, 10:], 0)
     prompts = prompts_of(config, config.processor())
-    batches = Batches(samples, config, prompts, (np.zeros(6, np.float32), np.ones(6, np.float32)), 8)
+    targets = np.zeros(6, np.float32), np.ones(6, np.float32)
+    batches = Batches(samples, config, Backbone(config.backbone_sizes), prompts, targets, 8)
     batch = batches.draw(0, 0)
     assert batch.state.shape == (8, 8)
     assert batch.actions.shape == (8, 16, 7)

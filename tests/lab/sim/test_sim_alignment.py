@@ -17,8 +17,8 @@ import torch.nn.functional as F
 from safetensors.torch import load_file
 
 from saccade import InputError
-from saccade.backbone.inputs import BackboneInputs
 from saccade.cli import main
+from saccade_lab.reference.backbone import PreparedInputs
 from saccade_lab.training import train
 from saccade_lab.training.learner import Learner, new_learner, pool_tokens
 from saccade_lab.training.settings import TrainingSettings
@@ -34,14 +34,14 @@ def recording() -> Path:
 def test_who_is_told_to_stand_still_sees_the_same_later(recording: Path) -> None:
     _, batches = make_batches(recording, dataclasses.replace(ALIGNED, absent_share=1.0))
     batch = batches.draw(0)
-    assert isinstance(batch.inputs, BackboneInputs)
-    assert isinstance(batch.later, BackboneInputs)
-    np.testing.assert_array_equal(batch.later.pixel_values, batch.inputs.pixel_values)
+    assert isinstance(batch.inputs, PreparedInputs)
+    assert isinstance(batch.later, PreparedInputs)
+    assert torch.equal(batch.later.pixels[0], batch.inputs.pixels[0])
     _, batches = make_batches(recording, dataclasses.replace(ALIGNED, batch_size=8))
     batch = batches.draw(0)
-    assert isinstance(batch.inputs, BackboneInputs)
-    assert isinstance(batch.later, BackboneInputs)
-    assert not np.array_equal(batch.later.pixel_values, batch.inputs.pixel_values)
+    assert isinstance(batch.inputs, PreparedInputs)
+    assert isinstance(batch.later, PreparedInputs)
+    assert not torch.equal(batch.later.pixels[0], batch.inputs.pixels[0])
 
 
 def test_pooling_means_runs_of_neighbours() -> None:
@@ -64,7 +64,8 @@ def test_alignment_loss_is_one_minus_the_cosine_of_the_future_rows(recording: Pa
     handle = run.learner.action_head.model.transformer_blocks[0].register_forward_hook(
         lambda module, inputs, output: rows.append(output)
     )
-    losses = run.learner.losses(batch, torch.Generator().manual_seed(0), run.average)
+    noise, time = run.learner.noise(batch, torch.Generator().manual_seed(0))
+    losses = run.learner.losses(batch, noise, time, run.average)
     handle.remove()
     losses["alignment_loss"].backward()
 
@@ -163,7 +164,7 @@ def test_without_alignment_steps_are_those_of_the_two_losses(recording: Path) ->
             noise=noise,
             time=time,
             action_mask=batch.mask,
-            drop_vl=~torch.from_numpy(batch.inputs.attention_mask),
+            drop_vl=~batch.inputs.attention_mask,
         )
         positions = F.mse_loss(learner.target_head(features[:, -1]), batch.targets)
         optimizer.zero_grad()

@@ -24,8 +24,9 @@ from saccade_lab.sim.tasks import find_task
 from saccade_lab.training import dataset, train
 from saccade_lab.training.batches import prompts_of
 from saccade_lab.training.dataset import load_samples
-from saccade_lab.training.frames import backbone_inputs, padded
+from saccade_lab.training.frames import padded
 from saccade_lab.training.frozen import FrozenFeatures
+from saccade_lab.training.inputs import prepared_inputs
 from tests.helpers.training_cases import RECORDING, TASKS, TINY, ignore
 
 BACKBONE = dataclasses.replace(TINY, only="backbone", steps=4, batch_size=4)
@@ -111,9 +112,9 @@ def test_features_of_a_frame_do_not_depend_on_its_batch(
     found = frozen(samples.now[rows])
     said = [prompts[samples.tasks[row]][samples.now[row] % 5] for row in rows]
     for number, row in enumerate(rows):
-        images = samples.images[samples.now[[row]]]
+        images = torch.from_numpy(samples.images[samples.now[[row]]])
         with torch.no_grad():
-            alone = backbone(backbone_inputs(images, [said[number]], "n1.5"))
+            alone = backbone(prepared_inputs(backbone, images, [said[number]]))
         length = len(said[number])
         assert not found.attention_mask[number, :-length].any()
         assert found.attention_mask[number, -length:].all()

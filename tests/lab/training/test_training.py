@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import threading
 from pathlib import Path
 from typing import Any
 
@@ -18,9 +17,9 @@ from safetensors.torch import load_file
 
 from saccade import InputError
 from saccade.backbone.inputs import BackboneInputs
+from saccade_lab.reference.backbone import PreparedInputs
 from saccade_lab.sim.policy import DEMO_CHECKPOINT, Policy
 from saccade_lab.training import train
-from saccade_lab.training.batches import DRAWING_THREADS, drawn
 from saccade_lab.training.learner import Learner
 from saccade_lab.training.settings import TrainingSettings
 from tests.helpers.training_cases import ALIGNED, RECORDING, TASKS, TINY, ignore, make_batches, recorded
@@ -55,66 +54,6 @@ def test_training_resumes_to_the_same_weights(
     ends = [torch.load(tmp_path / name / "training.pt", weights_only=True) for name in ("whole", "parts")]
     for name, tensor in ends[0]["learner"].items():  # including what is trained besides the policy
         assert torch.equal(tensor, ends[1]["learner"][name]), name
-
-
-@pytest.mark.parametrize("stop", [0, 1, 9])
-def test_batches_drawn_ahead_are_those_of_their_steps(recording: Path, stop: int) -> None:
-    run, batches = make_batches(recording, TINY)
-    steps = range(2, 2 + stop)
-    ahead = list(drawn(batches, run.settings.seed, steps, torch.device("meta")))
-    for batch, step in zip(ahead, steps, strict=True):
-        expected = batches.draw(run.settings.seed, step)
-        assert isinstance(batch.inputs, BackboneInputs)
-        assert isinstance(expected.inputs, BackboneInputs)
-        np.testing.assert_array_equal(batch.inputs.pixel_values, expected.inputs.pixel_values)
-        np.testing.assert_array_equal(batch.inputs.input_ids, expected.inputs.input_ids)
-        for name in ("state", "actions", "mask", "targets"):
-            assert torch.equal(getattr(batch, name), getattr(expected, name)), name
-    if stop > 1:
-        assert any(not torch.equal(ahead[0].state, other.state) for other in ahead[1:])
-
-
-class Counted:
-    """Draws the numbers of steps, and fails at one of them."""
-
-    def __init__(self, fails_at: int | None = None) -> None:
-        self.drawn: list[int] = []
-        self.fails_at = fails_at
-
-    def draw(self, seed: int, step: int) -> Any:
-        if step == self.fails_at:
-            raise InputError("a frame is missing")
-        self.drawn.append(step)
-        return step
-
-
-def test_what_cannot_be_drawn_ends_the_steps_after_those_before() -> None:
-    batches: Any = Counted(fails_at=7)
-    draws: Any = drawn(batches, 0, range(20), torch.device("meta"))
-    assert [next(draws) for _ in range(7)] == list(range(7))
-    with pytest.raises(InputError, match="a frame is missing"):
-        next(draws)
-
-
-def test_few_batches_are_drawn_ahead_and_none_after_the_end() -> None:
-    batches: Any = Counted()
-    draws: Any = drawn(batches, 0, range(1000), torch.device("meta"))
-    assert [next(draws), next(draws)] == [0, 1]
-    draws.close()
-    assert len(batches.drawn) <= 2 + DRAWING_THREADS
-    assert not any("ThreadPoolExecutor" in thread.name for thread in threading.enumerate())
-
-
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
-def test_pixels_for_a_gpu_are_page_locked(recording: Path) -> None:
-    run, batches = make_batches(recording, TINY)
-    (batch,) = drawn(batches, run.settings.seed, range(1), torch.device("cuda"))
-    expected = batches.draw(run.settings.seed, 0)
-    for found, same in ((batch.inputs, expected.inputs), (batch.later, expected.later)):
-        assert isinstance(found, BackboneInputs)
-        assert isinstance(same, BackboneInputs)
-        assert torch.from_numpy(found.pixel_values).is_pinned()
-        np.testing.assert_array_equal(found.pixel_values, same.pixel_values)
 
 
 def test_the_followed_tensors_stay_those_of_the_learner(recording: Path, tmp_path: Path) -> None:
@@ -169,14 +108,13 @@ def test_padding_changes_no_gradient(recording: Path) -> None:
     run, batches = make_batches(recording, dataclasses.replace(TINY, batch_size=6), with_later=False)
     run.learner.double()
     batch = batches.draw(0)
-    assert isinstance(batch.inputs, BackboneInputs)
-    lengths = batch.inputs.attention_mask.sum(axis=1)
+    assert isinstance(batch.inputs, PreparedInputs)
+    lengths = batch.inputs.attention_mask.sum(dim=1).tolist()
     assert len(set(lengths)) > 1
     features = run.learner.backbone(batch.inputs).backbone_features
     views = len(RECORDING.cameras)
     for row, length in enumerate(lengths):
-        pixels = batch.inputs.pixel_values
-        assert isinstance(pixels, np.ndarray)
+        (pixels,) = batch.inputs.pixels
         alone = BackboneInputs(
             pixels[row * views : (row + 1) * views], batch.inputs.input_ids[row : row + 1, -length:]
         )

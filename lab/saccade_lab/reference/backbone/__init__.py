@@ -4,6 +4,6 @@
 model.
 """
 
-from saccade_lab.reference.backbone.model import Backbone, BackboneFeatures
+from saccade_lab.reference.backbone.model import Backbone, BackboneFeatures, PreparedInputs
 
-__all__ = ["Backbone", "BackboneFeatures"]
+__all__ = ["Backbone", "BackboneFeatures", "PreparedInputs"]

@@ -9,11 +9,13 @@ Shapes in comments: B is the batch, T the tokens of a prompt, N the image tokens
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from os import PathLike
 from typing import Any
 
+import numpy as np
+import numpy.typing as npt
 import torch
 from torch import Tensor, nn
 
@@ -45,6 +47,30 @@ class BackboneFeatures:
     """bool `(B, T)`, as it was given."""
     image_mask: Tensor
     """bool `(B, T)`: True for image tokens."""
+    image_places: Tensor
+    """Where these are among the `B * T` tokens, `(N,)`."""
+
+
+@dataclass(frozen=True)
+class PreparedInputs:
+    """The inputs of a backbone, checked, as tensors on its device: nothing has to be read from it any more.
+
+    Attributes:
+        pixels: Views together where they have the same size, ``(V, 3, height, width)`` each. N1.7: the
+            patches of all views, ``(P, values)``.
+        grids: Rows and columns of patches of each view, those of the first prompt first.
+        input_ids: ``(B, T)``.
+        attention_mask: Bool ``(B, T)``.
+        image_places: See ``BackboneFeatures``.
+        positions: Of the tokens, ``(B, T)``. N1.7: on the axes of time, height and width, ``(3, B, T)``.
+    """
+
+    pixels: list[Tensor]
+    grids: list[tuple[int, int]]
+    input_ids: Tensor
+    attention_mask: Tensor
+    image_places: Tensor
+    positions: Tensor
 
 
 class Backbone(nn.Module):
@@ -118,27 +144,80 @@ class Backbone(nn.Module):
         """The dtype of the parameters, in which everything is computed."""
         return next(self.parameters()).dtype
 
-    def forward(self, inputs: BackboneInputs) -> BackboneFeatures:
+    @property
+    def device(self) -> torch.device:
+        """The device of the parameters."""
+        return next(self.parameters()).device
+
+    def forward(self, inputs: BackboneInputs | PreparedInputs) -> BackboneFeatures:
         """Computes the features of a batch.
+
+        Raises:
+            ShapeError, InputError: As ``prepare``, unless the inputs are prepared.
+        """
+        prepared = inputs if isinstance(inputs, PreparedInputs) else self.prepare(inputs)
+        features = self.core(prepared)
+        if self.sizes.project_to_dim is not None:
+            features = self.eagle_linear(features)
+        is_image = prepared.input_ids == self.sizes.image_token
+        return BackboneFeatures(features, prepared.attention_mask, is_image, prepared.image_places)
+
+    @property
+    def core(self) -> Eagle | Qwen3VlModel:
+        """Tower and language model."""
+        core: Any = self.eagle_model if self.sizes.version == "n1.5" else self.model
+        return core.model if self.sizes.version == "n1.7" else core
+
+    def prepare(self, inputs: BackboneInputs) -> PreparedInputs:
+        """Checks inputs and moves them to the device.
 
         Raises:
             ShapeError: Pixel values do not have the shape that the version takes.
             InputError: A token is not in the table, or the image tokens of the prompts are not those of the
                 views.
         """
-        ids = torch.from_numpy(inputs.input_ids)  # (B, T)
-        mask = torch.from_numpy(inputs.attention_mask)  # (B, T)
-        vocabulary = self.sizes.text.vocabulary
-        if ids.numel() and (int(ids.min()) < 0 or int(ids.max()) >= vocabulary):
+        pixels, grids = self.core.views(inputs)
+        return self.prepared(pixels, grids, inputs.input_ids, inputs.attention_mask)
+
+    def prepared(
+        self,
+        pixels: Sequence[Tensor],
+        grids: list[tuple[int, int]],
+        input_ids: npt.NDArray[np.int64],
+        attention_mask: npt.NDArray[np.bool_],
+    ) -> PreparedInputs:
+        """Checks prompts against their views, and moves both to the device.
+
+        Args:
+            pixels, grids: As in ``PreparedInputs``, on any device.
+            input_ids, attention_mask: ``(B, T)``.
+
+        Raises:
+            InputError: As ``prepare``.
+        """
+        ids, mask = torch.from_numpy(input_ids), torch.from_numpy(attention_mask)
+        sizes = self.sizes
+        if ids.numel() and (int(ids.min()) < 0 or int(ids.max()) >= sizes.text.vocabulary):
             raise InputError(
-                f"input_ids: expected 0 to {vocabulary - 1}, got {int(ids.min())} to {int(ids.max())}"
+                f"input_ids: expected 0 to {sizes.text.vocabulary - 1}, got {int(ids.min())} to "
+                f"{int(ids.max())}"
             )
-        device = next(self.parameters()).device
-        ids, mask = ids.to(device), mask.to(device)
-        features = (self.eagle_model if self.sizes.version == "n1.5" else self.model)(inputs, ids, mask)
-        if self.sizes.project_to_dim is not None:
-            features = self.eagle_linear(features)
-        return BackboneFeatures(features, mask, ids == self.sizes.image_token)
+        places = (ids == sizes.image_token).flatten().nonzero()[:, 0]
+        tokens = sum(rows * columns for rows, columns in grids) // sizes.merge**2
+        if len(places) != tokens:
+            raise InputError(
+                f"input_ids: expected {tokens} image tokens, as many as the views give, got {len(places)}"
+            )
+        if sizes.version == "n1.7":
+            positions = prompt_positions(ids, mask, grids, sizes)
+        else:
+            positions = torch.arange(ids.shape[1]).expand(ids.shape)  # padding counts
+        device = self.device
+        return PreparedInputs(
+            [views.to(device, self.dtype) for views in pixels],
+            grids,
+            *(one.to(device) for one in (ids, mask, places, positions)),
+        )
 
 
 class Eagle(nn.Module):
@@ -152,35 +231,35 @@ class Eagle(nn.Module):
         self.mlp1 = connector(inputs, sizes.text.width, sizes.connector_layers)
         self.language_model = LanguageModel(sizes.text, sizes.num_layers)
 
-    def forward(self, inputs: BackboneInputs, ids: Tensor, mask: Tensor) -> Tensor:
-        """Inputs with their ids and mask, ``(B, T)``, to ``(B, T, width)``."""
-        decoder = self.language_model.model
-        weight = decoder.embed_tokens.weight
-        tokens = [self.image_tokens(views.to(weight)) for views in self.views(inputs)]
-        x = with_image_tokens(decoder.embed_tokens(ids), ids == self.sizes.image_token, torch.cat(tokens))
-        # Positions count padding.
-        positions = torch.arange(ids.shape[1], device=ids.device).expand(ids.shape)
-        text = self.sizes.text
-        angles = text_angles(positions, text.theta, text.head_dim // 2, weight.dtype)  # (B, T, head_dim / 2)
-        return decoder(x, angles, mask)
+    def forward(self, inputs: PreparedInputs) -> Tensor:
+        """``(B, T, width)``."""
+        decoder, text = self.language_model.model, self.sizes.text
+        tokens = torch.cat([self.image_tokens(views) for views in inputs.pixels])
+        x = with_image_tokens(decoder.embed_tokens(inputs.input_ids), inputs.image_places, tokens)
+        angles = text_angles(inputs.positions, text.theta, text.head_dim // 2, x.dtype)
+        return decoder(x, angles, inputs.attention_mask)  # angles: (B, T, head_dim / 2)
 
-    def views(self, inputs: BackboneInputs) -> list[Tensor]:
-        """The views, together where they have the same size: each ``(V, 3, height, width)``."""
+    def views(self, inputs: BackboneInputs) -> tuple[list[Tensor], list[tuple[int, int]]]:
+        """The pixels and grids of ``PreparedInputs``."""
         pixels = inputs.pixel_values
         grouped = [torch.from_numpy(view) for view in (pixels if isinstance(pixels, tuple) else [pixels])]
-        side = self.sizes.vision.patch_size * self.sizes.merge
+        patch_size = self.sizes.vision.patch_size
+        side = patch_size * self.sizes.merge
         for views in grouped:
             shape = tuple(views.shape)
             if len(shape) != 4 or shape[1] != 3 or shape[2] % side or shape[3] % side or 0 in shape:
                 raise ShapeError(
                     f"pixel_values: expected (views, 3, height, width), multiples of {side}, got {shape}"
                 )
-            patches = shape[2] * shape[3] // self.sizes.vision.patch_size**2
+            patches = shape[2] * shape[3] // patch_size**2
             if self.sizes.version == "n1.5" and patches != self.sizes.vision.num_positions:
                 raise ShapeError(
                     f"pixel_values: expected {self.sizes.vision.num_positions} patches, got {patches}"
                 )
-        return grouped
+        grids = [
+            (view.shape[1] // patch_size, view.shape[2] // patch_size) for views in grouped for view in views
+        ]
+        return grouped, grids
 
     def image_tokens(self, views: Tensor) -> Tensor:
         """``(V, 3, height, width)`` to ``(V * tokens of a view, width)``."""
@@ -202,23 +281,17 @@ class Qwen3VlModel(nn.Module):
         self.visual = VisionTower(sizes)
         self.language_model = Decoder(sizes.text, sizes.num_layers, last_norm=False)
 
-    def forward(self, inputs: BackboneInputs, ids: Tensor, mask: Tensor) -> Tensor:
-        """Inputs with their ids and mask, ``(B, T)``, to ``(B, T, width)``."""
-        sizes, decoder = self.sizes, self.language_model
-        weight = decoder.embed_tokens.weight
-        patches, grids = self.patches(inputs)
-        tokens, stacked = self.visual(patches.to(weight), grids)  # (N, width) each
-        image_mask = ids == sizes.image_token
-        x = with_image_tokens(decoder.embed_tokens(ids), image_mask, tokens)
-        # From the inputs, which are on the CPU: `ids` and `mask` would have to be read back from a GPU.
-        given = torch.from_numpy(inputs.input_ids), torch.from_numpy(inputs.attention_mask)
-        positions = prompt_positions(*given, grids, sizes).to(ids.device)  # (3, B, T)
-        text = sizes.text
-        angles = interleaved_angles(positions, text.theta, text.head_dim // 2, text.sections, weight.dtype)
-        return decoder(x, angles, mask, added_after(stacked, image_mask))
+    def forward(self, inputs: PreparedInputs) -> Tensor:
+        """``(B, T, width)``."""
+        decoder, text = self.language_model, self.sizes.text
+        (patches,) = inputs.pixels
+        tokens, stacked = self.visual(patches, inputs.grids)  # (N, width) each
+        x = with_image_tokens(decoder.embed_tokens(inputs.input_ids), inputs.image_places, tokens)
+        angles = interleaved_angles(inputs.positions, text.theta, text.head_dim // 2, text.sections, x.dtype)
+        return decoder(x, angles, inputs.attention_mask, added_after(stacked, inputs.image_places))
 
-    def patches(self, inputs: BackboneInputs) -> tuple[Tensor, list[tuple[int, int]]]:
-        """The patches of all views, ``(P, values)``, and the grid of each view."""
+    def views(self, inputs: BackboneInputs) -> tuple[list[Tensor], list[tuple[int, int]]]:
+        """The pixels and grids of ``PreparedInputs``."""
         vision, pixels = self.sizes.vision, inputs.pixel_values
         values = 3 * vision.temporal_patch_size * vision.patch_size**2
         if isinstance(pixels, tuple) or pixels.ndim != 2 or pixels.shape[1] != values:
@@ -234,7 +307,7 @@ class Qwen3VlModel(nn.Module):
                 f"image_grid_thw: expected one frame a view, {pixels.shape[0]} patches and sides that are "
                 f"multiples of {self.sizes.merge}, got {inputs.image_grid_thw.tolist()}"
             )
-        return torch.from_numpy(pixels), grids
+        return [torch.from_numpy(pixels)], grids
 
 
 class Qwen3Vl(nn.Module):
@@ -244,36 +317,24 @@ class Qwen3Vl(nn.Module):
         super().__init__()
         self.model = Qwen3VlModel(sizes)
 
-    def forward(self, inputs: BackboneInputs, ids: Tensor, mask: Tensor) -> Tensor:
-        """As ``Qwen3VlModel``."""
-        return self.model(inputs, ids, mask)
 
-
-def with_image_tokens(x: Tensor, image_mask: Tensor, tokens: Tensor) -> Tensor:
+def with_image_tokens(x: Tensor, places: Tensor, tokens: Tensor) -> Tensor:
     """Embedded tokens whose image positions are replaced, prompt after prompt.
 
     Args:
         x: ``(B, T, width)``.
-        image_mask: Bool ``(B, T)``.
+        places: See ``PreparedInputs.image_places``.
         tokens: ``(N, width)``.
-
-    Raises:
-        InputError: There are not as many image positions as image tokens.
     """
-    places = int(image_mask.sum())
-    if places != tokens.shape[0]:
-        raise InputError(
-            f"input_ids: expected {tokens.shape[0]} image tokens, as many as the views give, got {places}"
-        )
-    return x.masked_scatter(image_mask[..., None], tokens)
+    return x.flatten(0, 1).index_copy(0, places, tokens).view_as(x)
 
 
-def added_after(stacked: list[Tensor], image_mask: Tensor) -> Callable[[int, Tensor], Tensor]:
+def added_after(stacked: list[Tensor], places: Tensor) -> Callable[[int, Tensor], Tensor]:
     """Adds the deepstack tokens of layer i, ``(N, width)``, to its output at image positions."""
 
     def add(index: int, x: Tensor) -> Tensor:
         if index >= len(stacked):
             return x
-        return x + torch.zeros_like(x).masked_scatter(image_mask[..., None], stacked[index])
+        return x.flatten(0, 1).index_add(0, places, stacked[index]).view_as(x)
 
     return add

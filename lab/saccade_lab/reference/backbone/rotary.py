@@ -18,15 +18,15 @@ def rotate(x: Tensor, angles: Tensor) -> Tensor:
     return torch.cat((first * cos - second * sin, second * cos + first * sin), dim=-1)
 
 
-def frequencies(theta: float, half: int, dtype: torch.dtype) -> Tensor:
+def frequencies(theta: float, half: int, dtype: torch.dtype, device: torch.device) -> Tensor:
     """``theta ** (-k / half)`` for k from 0, ``(half,)``, in float32 or wider."""
-    exponents = torch.arange(half, dtype=torch.float64) / half
+    exponents = torch.arange(half, dtype=torch.float64, device=device) / half
     return (theta**-exponents).to(torch.promote_types(dtype, torch.float32))
 
 
 def text_angles(positions: Tensor, theta: float, half: int, dtype: torch.dtype) -> Tensor:
     """Angles of positions on one axis, ``(...)`` to ``(..., half)``."""
-    inverse = frequencies(theta, half, dtype).to(positions.device)
+    inverse = frequencies(theta, half, dtype, positions.device)
     return positions[..., None].to(inverse.dtype) * inverse
 
 

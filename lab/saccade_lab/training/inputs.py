@@ -1,0 +1,68 @@
+"""What a backbone takes, from frames on its device and prompts."""
+
+# Some methods of tensors are untyped.
+# mypy: disable-error-code="no-any-return, no-untyped-call"
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+from saccade_lab.reference import Backbone
+from saccade_lab.reference.backbone import PreparedInputs
+from saccade_lab.training.frames import N17_MERGE, N17_PATCH, N17_REPEATS, PIXEL_CENTRE, padded
+
+
+def shifted(views: Tensor, moves: Tensor, largest: int) -> Tensor:
+    """Views shifted by whole numbers of pixels; edges are repeated.
+
+    Args:
+        views: ``(V, 3, H, W)``.
+        moves: Pixels by which what is seen begins further down and to the right, ``(V, 2)``.
+        largest: What no move exceeds in either direction.
+
+    Example:
+        >>> view = torch.arange(4).reshape(1, 1, 2, 2)
+        >>> shifted(view, torch.tensor([[1, 0]]), 1).tolist()
+        [[[[2, 3], [2, 3]]]]
+    """
+    height, width = views.shape[2:]
+    above, below = (views[:, :, row : row + 1].expand(-1, -1, largest, -1) for row in (0, height - 1))
+    wider = torch.cat((above, views, below), dim=2)
+    left, right = (wider[..., column : column + 1].expand(-1, -1, -1, largest) for column in (0, width - 1))
+    places = torch.cat((left, wider, right), dim=3).unfold(2, height, 1).unfold(3, width, 1)
+    first = moves + largest
+    return places[torch.arange(len(views), device=views.device), :, first[:, 0], first[:, 1]]
+
+
+def prepared_inputs(
+    backbone: Backbone, images: Tensor, prompts: Sequence[npt.NDArray[np.int64]], length: int = 0
+) -> PreparedInputs:
+    """What a backbone takes.
+
+    Args:
+        backbone: The backbone.
+        images: Frames as ``frames.prepared`` returns them, ``(B, cameras, 3, H, W)`` uint8.
+        prompts, length: See ``frames.padded``.
+    """
+    views = images.flatten(0, 1)
+    side = backbone.sizes.vision.patch_size
+    rows, columns = (pixels // side for pixels in views.shape[2:])
+    # As a tensor: a GPU multiplies by the inverse of a number, which rounds otherwise.
+    centre = torch.full((), float(PIXEL_CENTRE), device=views.device)
+    pixels = patches(views) if backbone.sizes.version == "n1.7" else views
+    pixels = (pixels.float() - centre) / centre
+    return backbone.prepared([pixels], [(rows, columns)] * len(views), *padded(prompts, length))
+
+
+def patches(views: Tensor) -> Tensor:
+    """``(V, 3, H, W)`` to N1.7's patches, ``(V * patches, 3 * repeats * patch**2)``, square after square."""
+    down, across = ((pixels // (N17_MERGE * N17_PATCH), N17_MERGE, N17_PATCH) for pixels in views.shape[2:])
+    squares = views.unflatten(3, across).unflatten(2, down)  # (V, 3, down, patches, y, right, patches, x)
+    ordered = squares.permute(0, 2, 5, 3, 6, 1, 4, 7)  # (V, down, right, patches, patches, 3, y, x)
+    once = ordered.reshape(-1, views.shape[1], 1, N17_PATCH**2)
+    return once.expand(-1, -1, N17_REPEATS, -1).flatten(1)
