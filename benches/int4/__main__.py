@@ -4,6 +4,7 @@
     python -m benches.int4 loop [--policy DIR]              success in closed loop on the same episodes
     python -m benches.int4 libero FLOAT32 INT4 [...]        the same on LIBERO, of runs of `saccade libero`
     python -m benches.int4 full                             memory, loading and time at N1.5's published size
+    python -m benches.int4 bench FILE [...]                 the head, in runs of `saccade bench --json`
     python -m benches.int4 calibrate                        how long its calibration takes, and its errors
     python -m benches.int4 report [--write]                 prints the page, or writes docs/results/int4.md
 
@@ -22,7 +23,7 @@ from typing import Any
 
 import saccade
 from benches.checkpoints import written
-from benches.int4 import accuracy, closed_loop, groups, libero, size, time
+from benches.int4 import accuracy, bench, closed_loop, groups, libero, size, time
 from benches.int4.page import document
 from benches.pages.report import report
 from benches.peers.machine import describe
@@ -97,7 +98,19 @@ def on_libero(args: argparse.Namespace) -> dict[str, Any]:
     return libero.measure(args.runs)
 
 
-MEASUREMENTS = {"errors": errors, "loop": loop, "libero": on_libero, "full": full, "calibrate": calibrate}
+def by_bench(args: argparse.Namespace) -> list[dict[str, Any]]:
+    """Times of the head."""
+    return bench.measure(args.files)
+
+
+MEASUREMENTS = {
+    "errors": errors,
+    "loop": loop,
+    "libero": on_libero,
+    "full": full,
+    "bench": by_bench,
+    "calibrate": calibrate,
+}
 
 
 def main() -> int:
@@ -116,6 +129,7 @@ def main() -> int:
     of["loop"].add_argument("--episodes", type=int, default=300, help="of a policy (default: 300)")
     of["loop"].add_argument("--jobs", type=int, default=2, help="processes (default: 2)")
     of["libero"].add_argument("runs", type=Path, nargs="+", metavar="DIR", help="that --out named")
+    of["bench"].add_argument("files", type=Path, nargs="+", metavar="FILE", help="that --json printed")
     for word in ("full", "calibrate"):
         of[word].add_argument("--num-threads", type=int, default=2)
     args = parser.parse_args()

@@ -48,6 +48,15 @@ The same policies, one observation at a time, by turns in one process: medians, 
 of one round with its quartiles. The first part is from images to the context of the head, the second a chunk
 from a held context."""
 
+ABOUT_BENCH = """\
+N1.5's head at its published size with random weights, in runs of `saccade bench --precisions int8 int4
+--num-vl-tokens 296 --profile --json`: each precision by turns, ratios as above."""
+
+RAN_BENCH = """\
+In the profile of a sample, kernels read weights at {int8:.0f} GB/s in int8 and at {int4:.0f} GB/s in int4, of
+{peak:.0f} GB/s that these threads can read. ({family}, {isa}, {num_threads} threads, saccade {saccade}; kept
+by `python -m benches.int4 bench`.)"""
+
 NAME = "outliers, N1.5 at its published size"
 SIZES = ("file, GB", "weights, GB", "peak at loading, GB", "peak with a call, GB", "loading, s", "reading, s")
 
@@ -61,28 +70,25 @@ def document(record: Mapping[str, Any]) -> str:
     ]
     for word, section in SECTIONS.items():
         if word in record:
-            parts += [*section(record[word]["measured"]), by(word, record[word])]
+            parts += section(record[word])
     return "\n\n".join(parts) + "\n"
 
 
-def by(word: str, record: Mapping[str, Any]) -> str:
-    """What measured, and on what machine."""
-    if word == "libero":  # by other processes than the one that read their results
-        ran = record["measured"]
-        return RAN_LIBERO.format(
-            cpu=ran["machine"]["cpu"], instruction_set=ran["instruction_set"], saccade=ran["saccade"]
-        )
+def here(word: str, record: Mapping[str, Any]) -> str:
+    """What command measured, and on what machine."""
     machine = record["machine"]
     where = f"{machine['cpu']} ({machine['family']}, {machine['isa']}), {machine['cores']} cores"
     return f"(`python -m benches.int4 {word}`: {where}; commit {machine['commit']}.)"
 
 
-def errors_section(measured: Mapping[str, Any]) -> list[str]:
+def errors_section(record: Mapping[str, Any]) -> list[str]:
     """Errors by precision, and by group of layers."""
+    measured = record["measured"]
     about = ABOUT.format_map(measured["observations"])
     parts = ["## Errors by precision", about, *map(recipe, *zip(*measured["policies"].items(), strict=True))]
     parts.append(errors(measured["models"]))
-    return [*parts, "## One group of layers at a time", ABOUT_GROUPS, groups(measured["groups"])]
+    parts += ["## One group of layers at a time", ABOUT_GROUPS, groups(measured["groups"])]
+    return [*parts, here("errors", record)]
 
 
 def recipe(name: str, policy: Mapping[str, Any]) -> str:
@@ -102,38 +108,56 @@ def recipe(name: str, policy: Mapping[str, Any]) -> str:
     return f"{weights}; {episodes}, then `saccade train {train}`, which has the seed {settings['seed']}."
 
 
-def loop_section(measured: Mapping[str, Any]) -> list[str]:
+def loop_section(record: Mapping[str, Any]) -> list[str]:
     """Success in closed loop."""
-    return ["## Closed loop", ABOUT_LOOP, loops(measured)]
+    return ["## Closed loop", ABOUT_LOOP, loops(record["measured"]), here("loop", record)]
 
 
-def libero_section(measured: Mapping[str, Any]) -> list[str]:
-    """Success on LIBERO."""
+def libero_section(record: Mapping[str, Any]) -> list[str]:
+    """Success on LIBERO, in runs of other processes than the one that read their results."""
+    measured = record["measured"]
     checkpoint, protocol = measured["checkpoint"], measured["protocol"]
     words = ABOUT_LIBERO.format(
         sha256=checkpoint["sha256"][:16], protocol=protocol["name"], start=protocol["start"]
     )
-    return ["## Closed loop on LIBERO", words, loops(measured["runs"])]
+    source = RAN_LIBERO.format(
+        cpu=measured["machine"]["cpu"],
+        instruction_set=measured["instruction_set"],
+        saccade=measured["saccade"],
+    )
+    return ["## Closed loop on LIBERO", words, loops(measured["runs"]), source]
 
 
-def full_section(measured: Mapping[str, Any]) -> list[str]:
+def full_section(record: Mapping[str, Any]) -> list[str]:
     """Memory, loading and time at published size."""
+    measured = record["measured"]
     parts = ["## Memory and loading", ABOUT_SIZE, size(measured["size"])]
-    return [*parts, "## Time", ABOUT_TIME, times(measured["time"])]
+    return [*parts, "## Time", ABOUT_TIME, times(measured["time"]), here("full", record)]
 
 
-def calibration_section(measured: Mapping[str, Any]) -> list[str]:
+def bench_section(record: Mapping[str, Any]) -> list[str]:
+    """Times of the head on other machines, in runs of `saccade bench`."""
+    parts = ["## Time of the head on another machine", ABOUT_BENCH]
+    for run in record["measured"]:
+        rates = {name: rate / 1e9 for name, rate in run["read"].items()}
+        parts += [times(run["time"]), RAN_BENCH.format(saccade=run["saccade"], **run["machine"], **rates)]
+    return parts
+
+
+def calibration_section(record: Mapping[str, Any]) -> list[str]:
     """How long calibration takes."""
+    measured = record["measured"]
     words = (
         f"`saccade quantize --calibrate` of the same policy, for {measured['observations']} observations "
         f"({measured['weights']} weights): {measured['seconds'] / 60:.1f} minutes, and at most "
         f"{measured['peak'] / 1e9:.1f} GB of memory."
     )
-    parts = ["## Calibration", words]
     return [
-        *parts,
+        "## Calibration",
+        words,
         f"Errors as above, on {MEASURED} other random observations:",
         errors({NAME: measured["errors"]}),
+        here("calibrate", record),
     ]
 
 
@@ -142,6 +166,7 @@ SECTIONS: dict[str, Callable[[Mapping[str, Any]], list[str]]] = {
     "loop": loop_section,
     "libero": libero_section,
     "full": full_section,
+    "bench": bench_section,
     "calibrate": calibration_section,
 }
 

@@ -69,6 +69,14 @@ def record() -> dict[str, Any]:
             },
             "time": {"sample": {"int8": [0.2, 0.4, 0.2], "int4": [0.1, 0.4, 0.18]}},
         },
+        "bench": [
+            {
+                "saccade": "0.1.0",
+                "machine": {"family": "a third family", "isa": "amx", "num_threads": 2},
+                "time": {"encode": {"int8": [0.2, 0.4, 0.2], "int4": [0.2, 0.3, 0.1]}},
+                "read": {"int8": 15e9, "int4": 7e9, "peak": 30e9},
+            }
+        ],
         "calibrate": {"observations": 16, "weights": 400, "seconds": 90.0, "peak": 7e9, "errors": RUNS},
     }
     return {word: {"machine": MACHINE, "measured": one} for word, one in measured.items()}
@@ -89,11 +97,14 @@ def test_the_page() -> None:
         "| **int4**: libero_object | | | |",
         "| float32 | 2 of 3 |  |  |",
         "| sample | 200 | 180 | 0.90 (0.70 to 0.95) |",
+        "| encode | 200 | 200 | 0.75 (0.62 to 0.88) |",
     ):
         assert line in lines
     text = " ".join(lines)
     assert text.count("a CPU (a family, avx2), 2 cores; commit abc") == 4
     assert "another CPU, avx512, saccade 0.1.0" in text
+    assert "15 GB/s in int8 and at 7 GB/s in int4, of 30 GB/s" in text
+    assert "(a third family, amx, 2 threads, saccade 0.1.0;" in text
     assert "rounded for 24 observations, and errors are those on 12." in text
     assert "The bundled policy: checkpoint aaaaaaaaaaaaaaaa." in text
     assert (
