@@ -64,8 +64,8 @@ class Recorded:
 class CudaGraphs:
     """Computes losses and gradients by CUDA graphs, one for each shape of what is given.
 
-    A small policy's step is 1,800 kernels of 5 microseconds. Launching them one by one takes Python eight
-    times as long as they run (an H100, 32 frames).
+    A small policy's step is 1,800 kernels of 5 microseconds. Launching them one by one takes seven times as
+    long as they run: 67 ms instead of 9 for 32 frames of LIBERO, on an H100.
 
     Args:
         compute: The losses of a batch. It writes gradients, reads nothing back from the GPU, and changes
