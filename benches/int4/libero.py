@@ -65,7 +65,8 @@ def _settings(run: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _name(run: Mapping[str, Any], first: Mapping[str, Any]) -> str:
-    """The precision of backbone and head, both if they differ, and the checkpoint if it is another one."""
-    precision = ", ".join(dict.fromkeys(run["options"]["precision"].values()))
+    """The precision of backbone and head, each if they differ, and the checkpoint if it is another one."""
+    backbone, head = (run["options"]["precision"][part] for part in ("backbone", "head"))
+    precision = head if backbone == head else f"backbone {backbone}, head {head}"
     is_same = run["checkpoint"]["sha256"] == first["checkpoint"]["sha256"]
     return precision if is_same else f"{precision}: {run['checkpoint']['name']}"

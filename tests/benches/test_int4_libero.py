@@ -33,7 +33,8 @@ def run(
         {"suite": "libero_object", "task": task, "trial": trial, "success": success, "steps": 9}
         for (task, trial), success in episodes.items()
     ]
-    options = {"precision": {"backbone": precision, "head": precision}, "embodiment": embodiment}
+    backbone, _, head = precision.partition(" ")
+    options = {"precision": {"backbone": backbone, "head": head or backbone}, "embodiment": embodiment}
     folder.mkdir()
     (folder / "results.json").write_text(json.dumps(ABOUT | {"options": options, "episodes": rows} | changes))
     return folder
@@ -52,14 +53,16 @@ def test_episodes_are_paired_by_task_and_trial(tmp_path: Path) -> None:
     assert found["protocol"] == {"name": "lerobot", "start": "official states"}
 
 
-def test_another_checkpoint_is_named(tmp_path: Path) -> None:
+def test_other_checkpoints_and_mixed_precisions_are_named(tmp_path: Path) -> None:
     exact = run(tmp_path / "a", "float32", {(0, 0): True})
     plain = run(tmp_path / "b", "int4", {(0, 0): False})
     rounded = run(tmp_path / "c", "int4", {(0, 0): True}, checkpoint={"name": "n17-int4", "sha256": "d"})
-    found = libero.measure([exact, plain, rounded])
+    mixed = run(tmp_path / "d", "int4 int8", {(0, 0): True})
+    found = libero.measure([exact, plain, rounded, mixed])
     assert {name: one["success"][name] for name, one in found["runs"].items()} == {
         "int4": [False],
         "int4: n17-int4": [True],
+        "backbone int4, head int8": [True],
     }
 
 
