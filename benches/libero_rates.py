@@ -2,8 +2,9 @@
 
     python -m benches.libero_rates DIR [DIR ...]       finished runs of one policy, each with its results.json
 
-Writes `benches/results/libero-rates.json` and prints the table. The record names what wrote it, and the runs
-name the version, the packages and the hash of the checkpoint.
+Writes `benches/results/libero-rates.json`, or with `--out` the record of another policy beside it, and prints
+the table. The record names what wrote it, and the runs name the version, the packages and the hash of the
+checkpoint.
 """
 
 from __future__ import annotations
