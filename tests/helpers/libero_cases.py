@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from saccade._internal.files import write_json
+from saccade_lab.libero.checkpoint import LiberoConfig, recorded_statistics
 from saccade_lab.libero.recording import LiberoRecording
 from saccade_lab.sim.demos import Demonstration
 from saccade_lab.training.settings import LIBERO_SETTINGS, TrainingSettings
@@ -63,3 +64,12 @@ def write_recording(folder: Path, episodes: int = 2, frame_stride: int = STRIDE)
             one = demonstration(10 * task + episode, frame_stride=frame_stride)
             path.write_bytes(one.to_bytes())
     return folder
+
+
+def with_statistics(config: LiberoConfig) -> LiberoConfig:
+    """A config with the statistics of random numbers."""
+    rng = np.random.default_rng(1)
+    numbers = recorded_statistics(
+        rng.uniform(-1, 1, (9, 8)).astype(np.float32), rng.uniform(-1, 1, (9, 7)).astype(np.float32)
+    )
+    return dataclasses.replace(config, statistics=numbers)

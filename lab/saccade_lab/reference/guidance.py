@@ -9,7 +9,7 @@ import numpy as np
 from torch import Tensor
 
 from saccade.errors import InputError
-from saccade_lab.reference.intervene import Mask
+from saccade_lab.reference.masks import Mask
 
 
 @dataclass(frozen=True)

@@ -32,7 +32,7 @@ from saccade_lab.reference import loading
 from saccade_lab.reference.checks import as_embodiment, check_shape
 from saccade_lab.reference.chunking import start_of
 from saccade_lab.reference.guidance import Guidance
-from saccade_lab.reference.intervene import Mask, Run, removal_bias, token_mask
+from saccade_lab.reference.intervene import Run
 from saccade_lab.reference.layers import (
     NORM_EPS,
     ActionEncoder,
@@ -41,6 +41,7 @@ from saccade_lab.reference.layers import (
     VlSelfAttention,
     token_table,
 )
+from saccade_lab.reference.masks import Mask, removal_bias, token_mask
 from saccade_lab.reference.state_dropout import STATE_DROPOUT, check_probabilities, drops_states, seen_state
 from saccade_lab.reference.training import TimeDistribution, flow_matching_error, hold_unused, is_unused
 

@@ -9,20 +9,19 @@ self-attention block.
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from saccade._internal.arrays import boolean, indices, integer
+from saccade._internal.arrays import indices, integer
 from saccade.errors import InputError
 from saccade.head.config import HeadConfig
 from saccade.head.intervention import ROW_GROUPS, Chosen, Intervention, Tokens, as_interventions
 from saccade.head.trace import check_record
-from saccade_lab.reference.checks import can_be_read, check_indices, check_shape
-
-Mask: TypeAlias = "Tensor | np.ndarray | None"
+from saccade_lab.reference.checks import check_indices, check_shape
+from saccade_lab.reference.masks import Mask, forbidden_tokens, is_cross, removal_bias
 
 
 @dataclass(frozen=True)
@@ -373,11 +372,6 @@ class Run:
         raise InputError(f"{name}: expected at least one {group} token, got an empty list")
 
 
-def is_cross(config: HeadConfig, block: int) -> bool:
-    """Whether this is a cross-attention block. The others are self-attention."""
-    return block % 2 == 0 or not config.interleave_self_attention
-
-
 def stopped_edges(pairs: Sequence[tuple[Tokens, Tokens]]) -> Intervention:
     """Pairs (reader, source) as the normalised cut of an intervention.
 
@@ -388,89 +382,3 @@ def stopped_edges(pairs: Sequence[tuple[Tokens, Tokens]]) -> Intervention:
         return Intervention(cut=pairs)
     except InputError as error:
         raise InputError(f"stop_gradient: {error}") from None
-
-
-def reads_images(config: HeadConfig, block: int) -> bool:
-    """Whether this cross-attention block of a head with alternate masks attends to image tokens.
-
-    The others attend to text.
-    """
-    return block % (2 * config.attend_text_every_n_blocks) != 0
-
-
-def forbidden_tokens(
-    config: HeadConfig, tokens: Tensor, *, drop_vl: Mask, attention_mask: Mask, image_mask: Mask
-) -> list[Tensor | None]:
-    """The vision-language tokens that no row attends to, for each block.
-
-    Args:
-        config: Config of the head.
-        tokens: ``(B, S, context_dim)``.
-        drop_vl: Bool ``(B, S)``, True for tokens that are removed.
-        attention_mask: Bool ``(B, S)``, True where a token is attended; None for all.
-        image_mask: Bool ``(B, S)``, True for image tokens. Required with alternate masks.
-
-    Returns:
-        For every block bool ``(B, S)``, or None if it attends to all tokens.
-
-    Raises:
-        DtypeError, ShapeError: A mask has the wrong dtype or shape.
-        InputError: Padding is given to a head that ignores it, a mask is missing, or a block has no token to
-            attend to in an observation. While a CUDA graph is recorded, only what needs no values is checked.
-    """
-    removed = token_mask("drop_vl", drop_vl, tokens)
-    attended = token_mask("attention_mask", attention_mask, tokens)
-    image = token_mask("image_mask", image_mask, tokens)
-    if config.mask_mode == "none":
-        if attended is not None and can_be_read(attended) and not attended.all():
-            raise InputError(
-                "attention_mask: expected all true, because the released head ignores padding, got a false "
-                "entry; drop_vl removes tokens"
-            )
-        return [removed] * config.num_layers
-    if image is None:
-        raise InputError(
-            "image_mask: expected bool (batch, T_vl), because blocks of this head attend to either text or "
-            "images, got None"
-        )
-    permitted = torch.ones_like(image) if attended is None else attended
-    if removed is not None:
-        permitted = permitted & ~removed
-    forbidden: list[Tensor | None] = []
-    for block in range(config.num_layers):
-        if not is_cross(config, block):
-            forbidden.append(None)
-            continue
-        kind, chosen = ("image", image) if reads_images(config, block) else ("text", ~image)
-        read = permitted & chosen  # (B, S)
-        if can_be_read(read) and not read.any(dim=1).all():
-            row = int(read.any(dim=1).int().argmin())
-            raise InputError(
-                f"image_mask: observation {row} has no {kind} token that block {block} can attend to"
-            )
-        forbidden.append(~read)
-    return forbidden
-
-
-def token_mask(name: str, given: Mask, tokens: Tensor) -> Tensor | None:
-    """A mask for ``tokens (B, S, context_dim)`` as a bool tensor ``(B, S)``, or None.
-
-    Raises:
-        DtypeError: The mask is not boolean.
-        ShapeError: The mask has another shape.
-    """
-    if isinstance(given, Tensor) and given.dtype == torch.bool:
-        mask = given.to(tokens.device)
-    else:
-        array = boolean(name, given.cpu() if isinstance(given, Tensor) else given)
-        if array is None:
-            return None
-        mask = torch.tensor(array, device=tokens.device)
-    check_shape(name, mask, tuple(tokens.shape[:2]))
-    return mask
-
-
-def removal_bias(removed: Tensor, dtype: torch.dtype) -> Tensor:
-    """Minus infinity on removed keys, ``(B, 1, 1, S)``, from ``(B, S)`` bool."""
-    bias = torch.zeros(removed.shape, dtype=dtype, device=removed.device).masked_fill(removed, -torch.inf)
-    return bias[:, None, None]

@@ -16,7 +16,8 @@ from torch import Tensor, nn
 from saccade.head.config import HeadConfig
 from saccade_lab.reference import tables
 from saccade_lab.reference.attention import Attention
-from saccade_lab.reference.intervene import BlockChange, is_cross
+from saccade_lab.reference.intervene import BlockChange
+from saccade_lab.reference.masks import is_cross
 
 NORM_EPS = 1e-5  # every LayerNorm except the last
 OUTPUT_NORM_EPS = 1e-6  # the last one

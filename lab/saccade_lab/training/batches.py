@@ -24,7 +24,7 @@ class Batches:
     """Draws batches on the device of a backbone, where all frames are kept.
 
     Args:
-        samples: The samples to draw from. On a GPU the frames of 400 demonstrations of LIBERO take 2.5 GB.
+        samples: The samples to draw from. The frames of 400 demonstrations of LIBERO take 2.5 GB.
         config: Config of the policy.
         backbone: Its backbone.
         prompts: What ``prompts_of`` returns.
@@ -56,7 +56,9 @@ class Batches:
         self._batch_size = batch_size
         self._absent_share, self._language_dropout, self._shift = absent_share, language_dropout, shift
         self._backbone = backbone
-        self._images = torch.from_numpy(samples.images).to(backbone.device)
+        self._images = torch.from_numpy(samples.images)
+        if frozen is None:
+            self._images = self._images.to(backbone.device)
         normalizer = config.normalizer
         self._state = np.asarray(normalizer.state(samples.state))
         self._actions = normalized_actions(normalizer, samples.actions) * samples.mask
@@ -91,8 +93,7 @@ class Batches:
             targets=torch.from_numpy(self._targets[rows]),
             later=self._inputs(later, prompts, rng) if self._with_later else None,
         )
-        moved: Batch = map_tensors(batch, lambda one: one.to(self._backbone.device))
-        return moved
+        return map_tensors(batch, lambda one: one.to(self._backbone.device))
 
     def _inputs(
         self,

@@ -1,4 +1,4 @@
-"""The losses of a run as a picture."""
+"""Plots the losses of a run."""
 
 from pathlib import Path
 from typing import Any

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from saccade_lab.reference import Backbone
 from saccade_lab.reference.backbone import PreparedInputs
+from saccade_lab.reference.backbone.model import Eagle
 from saccade_lab.training.frames import N17_MERGE, N17_PATCH, N17_REPEATS, PIXEL_CENTRE, padded
 
 
@@ -48,15 +49,23 @@ def prepared_inputs(
         backbone: The backbone.
         images: Frames as ``frames.prepared`` returns them, ``(B, cameras, 3, H, W)`` uint8.
         prompts, length: See ``frames.padded``.
+
+    Raises:
+        ShapeError, InputError: As ``Backbone.prepare``.
     """
-    views = images.flatten(0, 1)
-    side = backbone.sizes.vision.patch_size
-    rows, columns = (pixels // side for pixels in views.shape[2:])
+    views, core = images.flatten(0, 1), backbone.core
+    if isinstance(core, Eagle):
+        shown, grids = views, core.grids(views)
+    else:
+        shown, grids = patches(views), [grid_of(views)] * len(views)
     # As a tensor: a GPU multiplies by the inverse of a number, which rounds otherwise.
     centre = torch.full((), float(PIXEL_CENTRE), device=views.device)
-    pixels = patches(views) if backbone.sizes.version == "n1.7" else views
-    pixels = (pixels.float() - centre) / centre
-    return backbone.prepared([pixels], [(rows, columns)] * len(views), *padded(prompts, length))
+    return backbone.with_prompts([(shown.float() - centre) / centre], grids, *padded(prompts, length))
+
+
+def grid_of(views: Tensor) -> tuple[int, int]:
+    """Rows and columns of N1.7's patches in views ``(V, 3, H, W)``."""
+    return views.shape[2] // N17_PATCH, views.shape[3] // N17_PATCH
 
 
 def patches(views: Tensor) -> Tensor:

@@ -29,7 +29,7 @@ NUM_QUERIES = 12  # of ImageTargets: two for each view and position
 
 @dataclass(frozen=True)
 class Batch:
-    """Samples of a training step. Numbers are normalised.
+    """Samples of a training step, on the device of the policy. Numbers are normalised.
 
     Attributes:
         inputs: The observations, or the features of a backbone that is not trained; prompts are padded on the
@@ -92,7 +92,7 @@ class Learner(nn.Module):
                 nn.Linear(width, width),
             )
 
-    def noise(self, batch: Batch, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+    def draw_noise(self, batch: Batch, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         """Draws the noise of a batch, ``(B, T, action_dim)``, and the times of its flow, ``(B,)``."""
         noise = torch.randn(batch.actions.shape, generator=generator)
         return self.action_head.as_input(noise), self.action_head.sample_time(len(noise), generator)
@@ -104,7 +104,7 @@ class Learner(nn.Module):
 
         Args:
             batch: The samples.
-            noise, time: As ``noise`` draws them.
+            noise, time: As ``draw_noise`` returns them.
             average: The averaged tensors of the policy, whose backbone encodes the later observations.
 
         Returns:

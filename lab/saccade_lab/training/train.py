@@ -165,6 +165,7 @@ def gradients(run: Run, given: tuple[Batch, Tensor, Tensor]) -> dict[str, Tensor
     for name, weight in weights.items():
         if name in losses:
             total = total + weight * losses[name]
+    # Set to zero, not to None: all CUDA graphs write into the same gradients, which the first call makes.
     run.optimizer.zero_grad(set_to_none=False)
     total.backward()
     return {name: loss.detach() for name, loss in losses.items()}
@@ -178,7 +179,7 @@ def train_step(run: Run, batch: Batch) -> dict[str, float]:
     generator = torch.Generator().manual_seed(
         int(np.random.default_rng((settings.seed, run.step, 1)).integers(2**63))
     )
-    given = (batch, *run.learner.noise(batch, generator))
+    given = (batch, *run.learner.draw_noise(batch, generator))
     losses = gradients(run, given) if run.graphs is None else run.graphs(given)
     torch.nn.utils.clip_grad_norm_(run.learner.parameters(), MAX_GRADIENT_NORM)
     run.optimizer.step()
@@ -197,7 +198,7 @@ def validation_losses(run: Run, batches: Batches) -> dict[str, float]:
     current = {name: tensor.clone() for name, tensor in run.tensors.items()}
     run.learner.load_state_dict(run.average, strict=False)
     batch = batches.draw(0)
-    noise, time = run.learner.noise(batch, torch.Generator().manual_seed(0))
+    noise, time = run.learner.draw_noise(batch, torch.Generator().manual_seed(0))
     losses = run.learner.losses(batch, noise, time, run.average)
     run.learner.load_state_dict(current, strict=False)
     return {name: loss.item() for name, loss in losses.items()}
@@ -258,7 +259,8 @@ def resume(run: Run, path: Path) -> None:
     run.step, run.history = state["step"], state["history"]
     run.learner.load_state_dict(state["learner"])
     run.optimizer.load_state_dict(state["optimizer"])
-    run.average = state["average"]
+    for name, tensor in state["average"].items():
+        run.average[name].copy_(tensor)
 
 
 def config_of_start(config: PolicyConfig, policy: Path, only: str = "") -> PolicyConfig:
@@ -289,7 +291,8 @@ def start_from(run: Run, policy: Path) -> None:
         if name.startswith(prefix)
     }
     run.learner.load_state_dict(tensors, strict=False)
-    run.average = {name: tensor.clone() for name, tensor in run.tensors.items()}
+    for name, tensor in run.tensors.items():
+        run.average[name].copy_(tensor)
 
 
 def features_of(samples: str, settings: TrainingSettings, recorded: dict[str, Any], out: Path) -> Path:

@@ -73,7 +73,7 @@ def cost(training: TrainingSettings, recording: Recording) -> Cost:
         later=None if training.aligned_block is None else seen,
     )
 
-    noise, time = learner.noise(batch, torch.Generator().manual_seed(0))
+    noise, time = learner.draw_noise(batch, torch.Generator().manual_seed(0))
 
     def train() -> None:
         losses = learner.losses(batch, noise, time, learner.policy_tensors())

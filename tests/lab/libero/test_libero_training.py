@@ -21,9 +21,7 @@ from saccade_lab.libero.checkpoint import (
     CAMERAS,
     EMBODIMENT,
     STATE_GROUPS,
-    LiberoConfig,
     policy_actions,
-    recorded_statistics,
 )
 from saccade_lab.libero.policy import LiberoPolicy
 from saccade_lab.libero.recording import EXPERT, describe, is_recording, load_samples, read_recordings
@@ -34,7 +32,7 @@ from saccade_lab.training.batches import Batches, prompts_of
 from saccade_lab.training.inputs import prepared_inputs
 from saccade_lab.training.settings import LIBERO_SETTINGS, released_std
 from saccade_lab.training.train import Progress, new_run
-from tests.helpers.libero_cases import SAID, SIZE, TINY, demonstration, tiny, write_recording
+from tests.helpers.libero_cases import SAID, SIZE, TINY, demonstration, tiny, with_statistics, write_recording
 
 VERSIONS = ["n1.5", "n1.7"]
 
@@ -222,14 +220,6 @@ def test_a_padded_prompt_changes_nothing(version: str, recording: Path) -> None:
     with torch.no_grad():
         alone = [loss([row]) for row in rows]
         assert loss(rows) == pytest.approx(np.mean(alone), rel=1e-9)
-
-
-def with_statistics(config: LiberoConfig) -> LiberoConfig:
-    rng = np.random.default_rng(1)
-    numbers = recorded_statistics(
-        rng.uniform(-1, 1, (9, 8)).astype(np.float32), rng.uniform(-1, 1, (9, 7)).astype(np.float32)
-    )
-    return dataclasses.replace(config, statistics=numbers)
 
 
 def test_actions_after_a_disturbance_and_words_of_each_task(recording: Path) -> None:

@@ -64,7 +64,7 @@ def test_alignment_loss_is_one_minus_the_cosine_of_the_future_rows(recording: Pa
     handle = run.learner.action_head.model.transformer_blocks[0].register_forward_hook(
         lambda module, inputs, output: rows.append(output)
     )
-    noise, time = run.learner.noise(batch, torch.Generator().manual_seed(0))
+    noise, time = run.learner.draw_noise(batch, torch.Generator().manual_seed(0))
     losses = run.learner.losses(batch, noise, time, run.average)
     handle.remove()
     losses["alignment_loss"].backward()

@@ -6,33 +6,64 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
-from torch._subclasses.fake_tensor import FakeTensorMode
+from torch._subclasses.fake_tensor import DataDependentOutputException, FakeTensorMode
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from saccade_lab.reference import intervene
+from saccade_lab.libero.recording import describe, load_samples, read_recordings
+from saccade_lab.libero.sizes import libero_config
+from saccade_lab.reference import masks, tables
 from saccade_lab.training import train
+from saccade_lab.training.batches import Batches, prompts_of
 from saccade_lab.training.graphs import map_tensors, tensors_of
 from saccade_lab.training.learner import Batch
-from saccade_lab.training.settings import TrainingSettings
+from tests.helpers import libero_cases
 from tests.helpers.training_cases import ALIGNED, TINY, make_batches, recorded
 
 Given = tuple[Batch, torch.Tensor, torch.Tensor]
-WHOLE = pytest.mark.parametrize(
-    "settings",
-    [TINY, ALIGNED, dataclasses.replace(TINY, only="backbone")],
-    ids=["plain", "aligned", "backbone"],
-)
+Made = tuple[train.Run, Batches]
 
 
-def make(settings: TrainingSettings) -> tuple[train.Run, Given]:
-    """A run before its first step, and its first batch with noise and times."""
-    run, batches = make_batches(recorded(), settings, with_later=settings.aligned_block is not None)
+def of_meta_world(device: str, **changes: Any) -> Made:
+    settings = dataclasses.replace(ALIGNED if "alignment_weight" in changes else TINY, **changes)
+    with_later = settings.aligned_block is not None
+    return make_batches(recorded(), settings, with_later=with_later, device=device)
+
+
+def of_libero(device: str, recording: Path) -> Made:
+    """A policy of N1.7's kind."""
+    settings = libero_cases.tiny("n1.7")
+    config = libero_config(settings, libero_cases.SAID, libero_cases.SIZE)
+    tasks = read_recordings(recording)
+    samples, _ = load_samples(recording, tasks, settings.horizon, config.processor())
+    config = libero_cases.with_statistics(config)
+    run = train.new_run(settings, config, describe(recording, tasks), device)
+    targets = samples.targets.mean(axis=0), samples.targets.std(axis=0) + 1
+    prompts = prompts_of(config, config.processor())
+    return run, Batches(samples, config, run.learner.backbone, prompts, targets, 2, shift=2)
+
+
+@pytest.fixture(params=["plain", "aligned", "backbone", "n1.7"])
+def make(request: pytest.FixtureRequest, tmp_path: Path) -> Callable[[str], Made]:
+    """Makes a run before its first step, and what it draws from, on a device."""
+    recording = libero_cases.write_recording(tmp_path)
+    return {
+        "plain": of_meta_world,
+        "aligned": lambda device: of_meta_world(device, alignment_weight=0.2),
+        "backbone": lambda device: of_meta_world(device, only="backbone"),
+        "n1.7": lambda device: of_libero(device, recording),
+    }[request.param]
+
+
+def first(run: train.Run, batches: Batches) -> Given:
+    """The first batch with its noise and times."""
     batch = batches.draw(0)
-    return run, (batch, *run.learner.noise(batch, torch.Generator().manual_seed(0)))
+    return (batch, *run.learner.draw_noise(batch, torch.Generator().manual_seed(0)))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -59,16 +90,29 @@ class Moves(TorchDispatchMode):
         result = function(*args, **(kwargs or {}))
         if str(function) == "aten._to_copy.default":
             self.count += args[0].device != result.device
+        if str(function) == "aten.copy_.default":
+            self.count += args[0].device != args[1].device
         return result
 
 
-@WHOLE
+@pytest.fixture
+def no_tables() -> Iterator[None]:
+    """Tables are made anew: pretended ones must not stay for other tests."""
+    for clear in (True, False):
+        tables.action_frequencies.cache_clear()
+        tables.timestep_frequencies.cache_clear()
+        if clear:
+            yield
+
+
+@pytest.mark.usefixtures("no_tables")
 def test_losses_read_nothing_from_a_gpu_and_move_nothing_to_it(
-    settings: TrainingSettings, monkeypatch: pytest.MonkeyPatch
+    make: Callable[[str], Made], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A graph cannot: on pretended tensors of a GPU, torch raises where a value would be read."""
     monkeypatch.setattr(torch.cuda, "is_current_stream_capturing", lambda: True)
-    run, given = make(settings)
+    run, batches = make("cpu")
+    given = first(run, batches)
     with FakeTensorMode(allow_non_fake_inputs=True) as mode:
 
         def pretended(tensor: torch.Tensor) -> torch.Tensor:
@@ -78,19 +122,20 @@ def test_losses_read_nothing_from_a_gpu_and_move_nothing_to_it(
             for name, parameter in list(module.named_parameters(recurse=False)):
                 setattr(module, name, torch.nn.Parameter(pretended(parameter)))
         average = {name: pretended(tensor) for name, tensor in run.average.items()}
-        there: Given = map_tensors(given, pretended)
+        there = map_tensors(given, pretended)
         run.learner.losses(*there, average)  # the first call makes tables
         with Moves() as moves:
             losses = run.learner.losses(*there, average)
         assert moves.count == 0
         assert all(loss.is_cuda for loss in losses.values())
-        with pytest.raises(Exception, match=r"data-dependent|DataDependent|_local_scalar_dense"):
+        with pytest.raises(DataDependentOutputException):
             losses["loss"].item()
 
 
 class Reads(TorchDispatchMode):
-    """Counts the operations whose result has a size that depends on values."""
+    """Counts the operations that read values, or whose result has a size that depends on values."""
 
+    NAMES = ("nonzero", "masked_select", "_local_scalar_dense", "equal.default")
     count = 0
 
     def __torch_dispatch__(self, function: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
@@ -98,33 +143,49 @@ class Reads(TorchDispatchMode):
         by_mask = isinstance(indices, (list, tuple)) and any(
             isinstance(one, torch.Tensor) and one.dtype == torch.bool for one in indices
         )
-        self.count += by_mask or any(name in str(function) for name in ("nonzero", "masked_select"))
+        self.count += by_mask or any(name in str(function) for name in self.NAMES)
         return function(*args, **(kwargs or {}))
 
 
-@WHOLE
-def test_no_size_depends_on_values_on_the_way_back_either(
-    settings: TrainingSettings, monkeypatch: pytest.MonkeyPatch
+def test_nothing_is_read_on_the_way_back_either(
+    make: Callable[[str], Made], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(intervene, "can_be_read", lambda tensor: False)
-    run, given = make(settings)
+    monkeypatch.setattr(masks, "can_be_read", lambda tensor: False)
+    run, batches = make("cpu")
+    losses = run.learner.losses(*first(run, batches), run.average)
+    total = torch.stack(list(losses.values())).sum()
     with Reads() as reads:
-        train.gradients(run, given)
+        total.backward()
     assert reads.count == 0
+    with Reads() as reads:
+        total.item()
+    assert reads.count == 1
 
 
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
-@WHOLE
-def test_a_graph_gives_what_its_kernels_give_one_by_one(settings: TrainingSettings) -> None:
+GPU = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+
+
+@GPU
+def test_batches_are_the_same_on_a_gpu(make: Callable[[str], Made]) -> None:
+    here, there = (first(*make(device)) for device in ("cpu", "cuda"))
+    for one, other in zip(tensors_of(here), tensors_of(there), strict=True):
+        assert torch.equal(one, other.cpu())
+
+
+@GPU
+def test_graphs_give_what_their_kernels_give_one_by_one(make: Callable[[str], Made], tmp_path: Path) -> None:
     found = []
-    for graphs in (False, True):
-        run, batches = make_batches(
-            recorded(), settings, with_later=settings.aligned_block is not None, device="cuda"
-        )
-        run.graphs = run.graphs if graphs else None
-        losses = [train.train_step(run, batches.draw(settings.seed, step)) for step in range(5)]
-        found.append((losses, run.average))
-    for one, other in zip(*(losses for losses, _ in found), strict=True):
-        assert one == pytest.approx(other, rel=1e-3)
-    for name, tensor in found[0][1].items():
-        torch.testing.assert_close(found[1][1][name], tensor, rtol=1e-2, atol=1e-4)
+    for repeated in (False, True):
+        run, batches = make("cuda")
+        run.graphs = run.graphs if repeated else None
+        train.train_step(run, batches.draw(0, 0))
+        train.validation_losses(run, batches)
+        train.save(run, tmp_path / str(repeated))
+        train.resume(run, tmp_path / str(repeated) / "training.pt")
+        found.append(([train.train_step(run, batches.draw(0, step)) for step in range(1, 9)], run.average))
+    (losses, average), (again, average_again) = found
+    assert len({tuple(one.values()) for one in again}) == 8
+    for one, other in zip(losses, again, strict=True):
+        assert one == pytest.approx(other, rel=1e-4)
+    for name, tensor in average.items():
+        torch.testing.assert_close(average_again[name], tensor, rtol=1e-3, atol=1e-5)

@@ -53,11 +53,11 @@ class BackboneFeatures:
 
 @dataclass(frozen=True)
 class PreparedInputs:
-    """The inputs of a backbone, checked, as tensors on its device: nothing has to be read from it any more.
+    """The checked inputs of a backbone on its device. Computing on them reads nothing back from a GPU.
 
     Attributes:
-        pixels: Views together where they have the same size, ``(V, 3, height, width)`` each. N1.7: the
-            patches of all views, ``(P, values)``.
+        pixels: In the dtype of the parameters: ``(V, 3, height, width)`` for the views of one size. N1.7:
+            the patches of all views, ``(P, values)``.
         grids: Rows and columns of patches of each view, those of the first prompt first.
         input_ids: ``(B, T)``.
         attention_mask: Bool ``(B, T)``.
@@ -177,9 +177,9 @@ class Backbone(nn.Module):
                 views.
         """
         pixels, grids = self.core.views(inputs)
-        return self.prepared(pixels, grids, inputs.input_ids, inputs.attention_mask)
+        return self.with_prompts(pixels, grids, inputs.input_ids, inputs.attention_mask)
 
-    def prepared(
+    def with_prompts(
         self,
         pixels: Sequence[Tensor],
         grids: list[tuple[int, int]],
@@ -189,7 +189,7 @@ class Backbone(nn.Module):
         """Checks prompts against their views, and moves both to the device.
 
         Args:
-            pixels, grids: As in ``PreparedInputs``, on any device.
+            pixels, grids: As in ``PreparedInputs``, on any device and in any dtype.
             input_ids, attention_mask: ``(B, T)``.
 
         Raises:
@@ -236,30 +236,33 @@ class Eagle(nn.Module):
         decoder, text = self.language_model.model, self.sizes.text
         tokens = torch.cat([self.image_tokens(views) for views in inputs.pixels])
         x = with_image_tokens(decoder.embed_tokens(inputs.input_ids), inputs.image_places, tokens)
+        # (B, T, head_dim / 2)
         angles = text_angles(inputs.positions, text.theta, text.head_dim // 2, x.dtype)
-        return decoder(x, angles, inputs.attention_mask)  # angles: (B, T, head_dim / 2)
+        return decoder(x, angles, inputs.attention_mask)
 
     def views(self, inputs: BackboneInputs) -> tuple[list[Tensor], list[tuple[int, int]]]:
         """The pixels and grids of ``PreparedInputs``."""
         pixels = inputs.pixel_values
         grouped = [torch.from_numpy(view) for view in (pixels if isinstance(pixels, tuple) else [pixels])]
-        patch_size = self.sizes.vision.patch_size
-        side = patch_size * self.sizes.merge
-        for views in grouped:
-            shape = tuple(views.shape)
-            if len(shape) != 4 or shape[1] != 3 or shape[2] % side or shape[3] % side or 0 in shape:
-                raise ShapeError(
-                    f"pixel_values: expected (views, 3, height, width), multiples of {side}, got {shape}"
-                )
-            patches = shape[2] * shape[3] // patch_size**2
-            if self.sizes.version == "n1.5" and patches != self.sizes.vision.num_positions:
-                raise ShapeError(
-                    f"pixel_values: expected {self.sizes.vision.num_positions} patches, got {patches}"
-                )
-        grids = [
-            (view.shape[1] // patch_size, view.shape[2] // patch_size) for views in grouped for view in views
-        ]
-        return grouped, grids
+        return grouped, [grid for views in grouped for grid in self.grids(views)]
+
+    def grids(self, views: Tensor) -> list[tuple[int, int]]:
+        """The grid of each of some views, ``(V, 3, height, width)``.
+
+        Raises:
+            ShapeError: They do not have the shape that the version takes.
+        """
+        vision = self.sizes.vision
+        side = vision.patch_size * self.sizes.merge
+        shape = tuple(views.shape)
+        if len(shape) != 4 or shape[1] != 3 or shape[2] % side or shape[3] % side or 0 in shape:
+            raise ShapeError(
+                f"pixel_values: expected (views, 3, height, width), multiples of {side}, got {shape}"
+            )
+        rows, columns = (pixels // vision.patch_size for pixels in shape[2:])
+        if self.sizes.version == "n1.5" and rows * columns != vision.num_positions:
+            raise ShapeError(f"pixel_values: expected {vision.num_positions} patches, got {rows * columns}")
+        return [(rows, columns)] * len(views)
 
     def image_tokens(self, views: Tensor) -> Tensor:
         """``(V, 3, height, width)`` to ``(V * tokens of a view, width)``."""
@@ -311,7 +314,7 @@ class Qwen3VlModel(nn.Module):
 
 
 class Qwen3Vl(nn.Module):
-    """The level of N1.7's names above the model."""
+    """The level of N1.7's names above the model; it is never called."""
 
     def __init__(self, sizes: BackboneSizes) -> None:
         super().__init__()
