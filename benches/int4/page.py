@@ -50,12 +50,13 @@ from a held context."""
 
 ABOUT_BENCH = """\
 N1.5's head at its published size with random weights, in runs of `saccade bench --precisions int8 int4
---num-vl-tokens 296 --profile --json`: each precision by turns, ratios as above."""
+--profile --json`: each precision by turns, ratios as above. A rented machine may change its speed within a
+run, so that the median of the ratios says more than the ratio of the medians."""
 
 RAN_BENCH = """\
 In the profile of a sample, kernels read weights at {int8:.0f} GB/s in int8 and at {int4:.0f} GB/s in int4, of
-{peak:.0f} GB/s that these threads can read. ({family}, {isa}, {num_threads} threads, saccade {saccade}; kept
-by `python -m benches.int4 bench`.)"""
+{peak:.0f} GB/s that these threads can read. ({family}, {isa}, {num_threads} threads, {num_vl_tokens}
+vision-language tokens, saccade {saccade}; kept by `python -m benches.int4 bench`.)"""
 
 NAME = "outliers, N1.5 at its published size"
 SIZES = ("file, GB", "weights, GB", "peak at loading, GB", "peak with a call, GB", "loading, s", "reading, s")
@@ -140,7 +141,7 @@ def bench_section(record: Mapping[str, Any]) -> list[str]:
     parts = ["## Time of the head on another machine", ABOUT_BENCH]
     for run in record["measured"]:
         rates = {name: rate / 1e9 for name, rate in run["read"].items()}
-        parts += [times(run["time"]), RAN_BENCH.format(saccade=run["saccade"], **run["machine"], **rates)]
+        parts += [times(run["time"]), RAN_BENCH.format_map({**run, **run["machine"], **rates})]
     return parts
 
 

@@ -48,19 +48,22 @@ def test_times_machine_and_rates_are_kept(tmp_path: Path) -> None:
     (found,) = bench.measure([tmp_path / "a.json"])
     assert found == {
         "saccade": "0.1.0",
+        "num_vl_tokens": 9,
         "machine": {"family": "F", "isa": "amx", "num_threads": 2},
         "time": {"encode": {"int8": [0, 0], "int4": [3, 3]}, "sample": {"int8": [1, 1], "int4": [4, 4]}},
         "read": {"int8": 100.0, "int4": 100.0, "peak": 7.0},
     }
 
 
-@pytest.mark.parametrize("wrong", ["precision", "profile", "batch"])
+@pytest.mark.parametrize("wrong", ["precision", "call", "profile", "batch"])
 def test_runs_of_something_else_are_refused(tmp_path: Path, wrong: str) -> None:
     other = run()
     if wrong == "precision":
         other["results"] = other["results"][:3]
+    elif wrong == "call":
+        del other["results"][4]
     elif wrong == "profile":
-        other["profile"] = []
+        del other["profile"][2]
     else:
         other["call"]["batch"] = 2
     (tmp_path / "a.json").write_text(json.dumps(other))

@@ -72,6 +72,7 @@ def record() -> dict[str, Any]:
         "bench": [
             {
                 "saccade": "0.1.0",
+                "num_vl_tokens": 296,
                 "machine": {"family": "a third family", "isa": "amx", "num_threads": 2},
                 "time": {"encode": {"int8": [0.2, 0.4, 0.2], "int4": [0.2, 0.3, 0.1]}},
                 "read": {"int8": 15e9, "int4": 7e9, "peak": 30e9},
@@ -104,7 +105,7 @@ def test_the_page() -> None:
     assert text.count("a CPU (a family, avx2), 2 cores; commit abc") == 4
     assert "another CPU, avx512, saccade 0.1.0" in text
     assert "15 GB/s in int8 and at 7 GB/s in int4, of 30 GB/s" in text
-    assert "(a third family, amx, 2 threads, saccade 0.1.0;" in text
+    assert "(a third family, amx, 2 threads, 296 vision-language tokens, saccade 0.1.0;" in text
     assert "rounded for 24 observations, and errors are those on 12." in text
     assert "The bundled policy: checkpoint aaaaaaaaaaaaaaaa." in text
     assert (

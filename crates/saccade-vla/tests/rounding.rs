@@ -70,8 +70,8 @@ fn error(x: &[f32], weight: &[f32], values: &[i8], scale: f32) -> f64 {
 
 /// Algorithm 1 of the paper for one row of weights: by the inverse of the damped Gram matrix, updated after each input.
 ///
-/// The matrix is the one that was summed in float32: with fewer rows than inputs, what a value is rounded from depends
-/// on its last digits ten thousand times as much.
+/// The matrix is the one that was summed in float32, which is compared with sums in float64 apart. With fewer rows than
+/// inputs its condition number is above a thousand, so that the last digits of the sums can change a rounded value.
 fn by_the_paper(weight: &[f32], scale: f32, sums: &Gram) -> Vec<i8> {
     let width = weight.len();
     let of_input = |i| (0..width).map(|j| f64::from(sums.get(i, j))).collect();
@@ -140,6 +140,11 @@ proptest! {
         let gram = gram(&x, width);
         let found = rounded(&weight, &scales, &gram, 1);
         let plain = plain(&weight, &scales, width);
+        for (i, j) in (0..width).flat_map(|i| (0..=i).map(move |j| (i, j))) {
+            let products = x.chunks_exact(width).map(|row| f64::from(row[i]) * f64::from(row[j]));
+            let (sum, size) = products.fold((0.0, 0.0), |(sum, size), one| (sum + one, size + one.abs()));
+            prop_assert!((f64::from(gram.get(i, j)) - sum).abs() <= 1e-5 * size);
+        }
         for (row, weight) in weight.chunks_exact(width).enumerate() {
             let of_row = row * width..(row + 1) * width;
             let values = &found.values[of_row.clone()];
