@@ -2,7 +2,7 @@
 
     python -m benches.int4 errors [--small] [--policy DIR]  of actions, by precision and by group of layers
     python -m benches.int4 loop [--policy DIR]              success in closed loop on the same episodes
-    python -m benches.int4 libero FLOAT32 INT4 [...]        the same on LIBERO, of runs of `saccade libero`
+    python -m benches.int4 libero FLOAT32 INT4 [...]        the same on LIBERO, in runs of `saccade libero`
     python -m benches.int4 full                             memory, loading and time at N1.5's published size
     python -m benches.int4 bench FILE [...]                 the head, in runs of `saccade bench --json`
     python -m benches.int4 calibrate                        how long its calibration takes, and its errors
@@ -93,7 +93,7 @@ def calibrate(args: argparse.Namespace) -> dict[str, Any]:
     return found | {"errors": accuracy.measure(*size.calibrated(args.work), note)}
 
 
-def on_libero(args: argparse.Namespace) -> dict[str, Any]:
+def on_libero(args: argparse.Namespace) -> list[dict[str, Any]]:
     """Success on LIBERO."""
     return libero.measure(args.runs)
 

@@ -14,22 +14,34 @@ from saccade_lab.files import changed
 COMMON = ("protocol", "noise", "saccade", "instruction_set", "packages", "machine", "option_files")
 
 
-def measure(folders: Sequence[Path]) -> dict[str, Any]:
-    """The success of the episodes that float32 and another run have, for each other run.
+def measure(folders: Sequence[Path]) -> list[dict[str, Any]]:
+    """The success of the episodes that float32 and other runs of a policy have, for each policy.
 
     Args:
-        folders: Directories that `saccade libero --out` wrote: the first of float32, the others of other
-            precisions or of checkpoints that `saccade quantize` made from that one.
+        folders: Directories that `saccade libero --out` wrote. Each run of float32 begins with a policy, and
+            runs of other precisions or of checkpoints that `saccade quantize` made from it follow.
 
     Returns:
-        What the first run says, and `runs` by the name of each other one: its precision, and its checkpoint
-        if that is another. Each has `tasks`, the suites, and `success` of both, episode by episode.
+        For each policy what its first run says, and `runs` by the name of each other one: its precision, and
+        its checkpoint if that is another. Each has `tasks`, the suites, and `success` of both, episode by
+        episode.
 
     Raises:
-        SystemExit: There are not several runs, the first is not of float32, two are the same, they differ in
-            more, or one has no episode of the first.
+        SystemExit: There is a policy without other runs, the first run is not of float32, two of a policy are
+            the same, they differ in more, or one has no episode of the first.
     """
-    runs = [json.loads((folder / "results.json").read_text()) for folder in folders]
+    policies: list[list[Path]] = []
+    for folder in folders:
+        precisions = _read(folder)["options"]["precision"].values()
+        if set(precisions) == {"float32"} or not policies:
+            policies.append([])
+        policies[-1].append(folder)
+    return [_policy(policy) for policy in policies]
+
+
+def _policy(folders: Sequence[Path]) -> dict[str, Any]:
+    """What ``measure`` returns of one policy."""
+    runs = [_read(folder) for folder in folders]
     first = runs[0]
     names = [_name(run, first) for run in runs]
     if len(runs) < 2 or names[0] != "float32" or len(set(names)) < len(names):
@@ -56,6 +68,10 @@ def measure(folders: Sequence[Path]) -> dict[str, Any]:
         "protocol": {name: first["protocol"][name] for name in ("name", "start")},
         "runs": pairs,
     }
+
+
+def _read(folder: Path) -> Any:
+    return json.loads((folder / "results.json").read_text())
 
 
 def _settings(run: Mapping[str, Any]) -> dict[str, Any]:

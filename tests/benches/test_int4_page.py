@@ -49,19 +49,21 @@ def record() -> dict[str, Any]:
                 },
             }
         },
-        "libero": {
-            "checkpoint": {"name": "n17", "sha256": 64 * "c"},
-            "machine": {"cpu": "another CPU"},
-            "instruction_set": "avx512",
-            "saccade": "0.1.0",
-            "protocol": {"name": "lerobot", "start": "official states"},
-            "runs": {
-                "int4": {
-                    "tasks": ["libero_object"],
-                    "success": {"float32": [True, True, False], "int4": [True, False, False]},
-                }
-            },
-        },
+        "libero": [
+            {
+                "checkpoint": {"name": "n17", "sha256": 64 * "c"},
+                "machine": {"cpu": "another CPU"},
+                "instruction_set": "avx512",
+                "saccade": "0.1.0",
+                "protocol": {"name": "lerobot", "start": "official states"},
+                "runs": {
+                    "int4": {
+                        "tasks": ["libero_object"],
+                        "success": {"float32": [True, True, False], "int4": [True, False, False]},
+                    }
+                },
+            }
+        ],
         "full": {
             "size": {
                 "int8": {"file_bytes": 2_000_000_000, "loads": [LOAD, LOAD, {**LOAD, "load": 50.0}]},
@@ -103,6 +105,7 @@ def test_the_page() -> None:
         assert line in lines
     text = " ".join(lines)
     assert text.count("a CPU (a family, avx2), 2 cores; commit abc") == 4
+    assert "(`n17`, checkpoint cccccccccccccccc: `saccade libero --protocol lerobot`, official" in text
     assert "another CPU, avx512, saccade 0.1.0" in text
     assert "15 GB/s in int8 and at 7 GB/s in int4, of 30 GB/s" in text
     assert "(a third family, amx, 2 threads, 296 vision-language tokens, saccade 0.1.0;" in text
