@@ -67,7 +67,7 @@ def test_other_checkpoints_and_mixed_precisions_are_named(tmp_path: Path) -> Non
 
 
 def test_each_run_of_float32_begins_with_a_policy(tmp_path: Path) -> None:
-    other = {"checkpoint": {"name": "n17-spatial", "sha256": "e"}}
+    other: dict[str, Any] = {"checkpoint": {"name": "n17-spatial", "sha256": "e"}}
     runs = [
         run(tmp_path / "a", "float32", {(0, 0): True}),
         run(tmp_path / "b", "int4", {(0, 0): False}),
