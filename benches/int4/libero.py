@@ -30,18 +30,18 @@ def measure(folders: Sequence[Path]) -> list[dict[str, Any]]:
         SystemExit: There is a policy without other runs, the first run is not of float32, two of a policy are
             the same, they differ in more, or one has no episode of the first.
     """
-    policies: list[list[Path]] = []
+    policies: list[list[tuple[Path, Any]]] = []
     for folder in folders:
-        precisions = _read(folder)["options"]["precision"].values()
-        if set(precisions) == {"float32"} or not policies:
+        run = json.loads((folder / "results.json").read_text())
+        if set(run["options"]["precision"].values()) == {"float32"} or not policies:
             policies.append([])
-        policies[-1].append(folder)
+        policies[-1].append((folder, run))
     return [_policy(policy) for policy in policies]
 
 
-def _policy(folders: Sequence[Path]) -> dict[str, Any]:
-    """What ``measure`` returns of one policy."""
-    runs = [_read(folder) for folder in folders]
+def _policy(named: Sequence[tuple[Path, Any]]) -> dict[str, Any]:
+    """What ``measure`` returns of one policy, from the folders and contents of its runs."""
+    folders, runs = zip(*named, strict=True)
     first = runs[0]
     names = [_name(run, first) for run in runs]
     if len(runs) < 2 or names[0] != "float32" or len(set(names)) < len(names):
@@ -68,10 +68,6 @@ def _policy(folders: Sequence[Path]) -> dict[str, Any]:
         "protocol": {name: first["protocol"][name] for name in ("name", "start")},
         "runs": pairs,
     }
-
-
-def _read(folder: Path) -> Any:
-    return json.loads((folder / "results.json").read_text())
 
 
 def _settings(run: Mapping[str, Any]) -> dict[str, Any]:

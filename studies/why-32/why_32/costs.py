@@ -60,8 +60,8 @@ def cost(training: TrainingSettings, recording: Recording) -> Cost:
     inputs = max((processor(frames, text) for text in texts), key=lambda one: one.input_ids.shape[1])
     learner = Learner(config.backbone_sizes, head, training.aligned_block, training.only)
     with torch.no_grad():
-        of_backbone = counted(lambda: learner.backbone(inputs))
         prepared = learner.backbone.prepare(inputs)
+        of_backbone = counted(lambda: learner.backbone(prepared))
         seen = learner.backbone(prepared) if training.only == "head" else prepared
     horizon = head.action_horizon
     batch = Batch(
