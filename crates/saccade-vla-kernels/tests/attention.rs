@@ -172,7 +172,7 @@ fn a_removed_key_has_no_influence_whatever_it_holds() {
                     "{kind}, {poison}: {out} instead of {expected}"
                 );
             }
-            for row in weights.chunks_exact(130) {
+            for row in weights.as_chunks::<130>().0 {
                 assert!(
                     [0, 40, 95, 96, 129].iter().all(|&key| row[key] == 0.0),
                     "{kind}, {poison}"
@@ -208,7 +208,7 @@ fn weights_are_the_probabilities_that_were_used() {
     for kind in kinds() {
         let mut weights = vec![f32::NAN; 3 * 11 * 405];
         let out = case.run(kind, 2, None, Some(&mut weights));
-        for (index, row) in weights.chunks_exact(405).enumerate() {
+        for (index, row) in weights.as_chunks::<405>().0.iter().enumerate() {
             let (head, query) = (index / 11, index % 11);
             let sum: f64 = row.iter().map(|&weight| f64::from(weight)).sum();
             assert!((sum - 1.0).abs() < 1e-5, "{kind}: weights add up to {sum}");

@@ -99,14 +99,14 @@ fn a_constant_row_gives_the_shift_and_nan_stays_in_its_row() {
             Some((&[3.0; 50], &[0.25; 50])),
             rows_mut(&mut out, 50),
         );
-        for (row, out) in out.chunks_exact(50).enumerate() {
+        for (row, out) in out.as_chunks::<50>().0.iter().enumerate() {
             if row == 2 || row == 3 {
                 assert!(
                     out.iter().all(|value| value.is_nan()),
                     "{isa}, row {row}: {out:?}"
                 );
             } else {
-                assert_eq!(out, [0.25; 50], "{isa}, row {row}");
+                assert_eq!(out, &[0.25; 50], "{isa}, row {row}");
             }
         }
     }

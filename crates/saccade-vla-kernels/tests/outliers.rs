@@ -49,7 +49,7 @@ fn planted(count: usize, inputs: usize) -> Vec<f32> {
 fn relative_error(out: &[f32], x: &[f32], weight: &[f64], inputs: usize) -> f64 {
     let bias = numbers(2, OUTPUTS, 1.0);
     let (mut errors, mut total) = (0.0, 0.0);
-    for (x, out) in x.chunks_exact(inputs).zip(out.chunks_exact(OUTPUTS)) {
+    for (x, out) in x.chunks_exact(inputs).zip(out.as_chunks::<OUTPUTS>().0) {
         let large: Vec<f64> = x
             .iter()
             .map(|&x| if x.abs() > 10.0 { f64::from(x) } else { 0.0 })

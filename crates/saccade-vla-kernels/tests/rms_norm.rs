@@ -85,9 +85,9 @@ fn zeros_stay_and_nan_stays_in_its_head() {
         x[2 * 50 + 49] = f32::NAN;
         x[3 * 50] = f32::INFINITY;
         rms_norm_in_place(isa, 2, rows_mut(&mut x, 100), 1e-5, &[3.0; 50]);
-        for (head, out) in x.chunks_exact(50).enumerate() {
+        for (head, out) in x.as_chunks::<50>().0.iter().enumerate() {
             match head {
-                0 => assert_eq!(out, [0.0; 50], "{isa}"),
+                0 => assert_eq!(out, &[0.0; 50], "{isa}"),
                 2 => assert!(out.iter().all(|value| value.is_nan()), "{isa}: {out:?}"),
                 3 => assert!(out[0].is_nan() && out[1] == 0.0, "{isa}: {out:?}"),
                 _ => assert!(

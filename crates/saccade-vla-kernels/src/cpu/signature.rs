@@ -34,8 +34,8 @@ impl Signature {
     #[cfg(any(all(target_arch = "x86_64", not(saccade_portable)), test))]
     fn decode(vendor: [u32; 3], version: u32) -> Self {
         let mut name = [0; 12];
-        for (to, word) in name.chunks_exact_mut(4).zip(vendor) {
-            to.copy_from_slice(&word.to_le_bytes());
+        for (to, word) in name.as_chunks_mut().0.iter_mut().zip(vendor) {
+            *to = word.to_le_bytes();
         }
         let field = |shift: u32, bits: u32| (version >> shift) & ((1 << bits) - 1);
         let (family, model) = (field(8, 4), field(4, 4));

@@ -127,7 +127,7 @@ fn add_bytes<const RUN: usize>(
     bytes: impl Fn(u32) -> u32,
 ) {
     for words in words.chunks_exact(columns * RUN) {
-        for (sum, words) in sums.iter_mut().zip(words[first * RUN..].chunks_exact(RUN)) {
+        for (sum, words) in sums.iter_mut().zip(words[first * RUN..].as_chunks::<RUN>().0) {
             let bytes = words.iter().flat_map(|&word| bytes(word).to_le_bytes());
             *sum += bytes.map(|byte| i32::from(byte.cast_signed())).sum::<i32>();
         }
@@ -169,7 +169,7 @@ fn put<T: Copy, const STEP: usize, const RUN: usize, const HALVES: usize>(
                     && k + BLOCK * STEP <= inputs
                 {
                     let elements = &elements[k..][..BLOCK * STEP];
-                    for (to, elements) in block.iter_mut().zip(elements.chunks_exact(STEP)) {
+                    for (to, elements) in block.iter_mut().zip(elements.as_chunks::<STEP>().0) {
                         *to = word(row, elements);
                     }
                 } else {

@@ -64,7 +64,7 @@ impl Job<'_> {
             };
             return self
                 .next
-                .fetch_update(Ordering::Relaxed, Ordering::Relaxed, take)
+                .try_update(Ordering::Relaxed, Ordering::Relaxed, take)
                 .ok();
         }
         let task = self.next.fetch_add(1, Ordering::Relaxed);
@@ -103,7 +103,7 @@ impl Job<'_> {
         self.next.load(Ordering::Relaxed) < self.tasks
             && self
                 .vacancies
-                .fetch_update(Ordering::Relaxed, Ordering::Relaxed, take)
+                .try_update(Ordering::Relaxed, Ordering::Relaxed, take)
                 .is_ok()
     }
 

@@ -60,10 +60,7 @@ impl Workers {
     pub(super) fn start(&'static self, wanted: usize, prepare: fn()) {
         while self.count.load(Ordering::Relaxed) < wanted {
             let take = |count: usize| (count < wanted).then_some(count + 1);
-            let Ok(index) = self
-                .count
-                .fetch_update(Ordering::Relaxed, Ordering::Relaxed, take)
-            else {
+            let Ok(index) = self.count.try_update(Ordering::Relaxed, Ordering::Relaxed, take) else {
                 return;
             };
             let thread = std::thread::Builder::new().name(format!("saccade-{}", index + 1));

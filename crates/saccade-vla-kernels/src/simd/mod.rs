@@ -233,10 +233,8 @@ pub(crate) trait Simd: Copy + Send + Sync + 'static {
     /// The transpose of the first `LANES` rows and columns of `square`, as `LANES` rows of `LANES` words.
     #[inline(always)]
     fn transpose(self, square: &[[u32; MAX_LANES]; MAX_LANES], to: &mut [u32]) {
-        for (column, to) in to[..Self::LANES * Self::LANES]
-            .chunks_exact_mut(Self::LANES)
-            .enumerate()
-        {
+        for column in 0..Self::LANES {
+            let to = &mut to[column * Self::LANES..][..Self::LANES];
             for (to, row) in to.iter_mut().zip(square) {
                 *to = row[column];
             }

@@ -266,7 +266,7 @@ fn patches<'a>(
     );
     let mut views = reserved("views", grid.shape()[0])?;
     let mut left = array.data();
-    for (index, sizes) in grid.data().chunks_exact(3).enumerate() {
+    for (index, sizes) in grid.data().as_chunks::<3>().0.iter().enumerate() {
         let side = |side: i64| {
             let side = usize::try_from(side).ok()?;
             (side > 0 && side.is_multiple_of(config.merge)).then_some(side)

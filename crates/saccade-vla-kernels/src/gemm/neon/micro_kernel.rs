@@ -192,10 +192,12 @@ unsafe fn panel_rows<S: Simd, E: Step<Lanes>, const NV: usize>(
 /// multiply-adds.
 #[inline(always)]
 fn widen<S: Simd>(simd: S, panel: &[u32], to: &mut [MaybeUninit<u32>]) -> *const u32 {
-    for (pairs, to) in panel.chunks_exact(COLUMNS).zip(to.chunks_exact_mut(2 * COLUMNS)) {
+    let parts = to.as_chunks_mut::<{ 2 * COLUMNS }>().0;
+    for (pairs, to) in panel.as_chunks::<COLUMNS>().0.iter().zip(parts) {
         let (low, high) = to.split_at_mut(COLUMNS);
-        let vectors = low.chunks_exact_mut(VECTOR).zip(high.chunks_exact_mut(VECTOR));
-        for (words, (low, high)) in pairs.chunks_exact(VECTOR).zip(vectors) {
+        let (low, high) = (low.as_chunks_mut::<VECTOR>().0, high.as_chunks_mut::<VECTOR>().0);
+        let vectors = low.iter_mut().zip(high);
+        for (words, (low, high)) in pairs.as_chunks::<VECTOR>().0.iter().zip(vectors) {
             let words = simd.load_words(words);
             // SAFETY: both have room for a vector.
             unsafe {

@@ -124,7 +124,7 @@ impl Siglip {
                 PixelOrder::ChannelLast => {
                     for (y, to) in vector.chunks_exact_mut(size * CHANNELS).enumerate() {
                         let lines: [_; CHANNELS] = std::array::from_fn(|channel| line(channel, y));
-                        for (x, to) in to.chunks_exact_mut(CHANNELS).enumerate() {
+                        for (x, to) in to.as_chunks_mut::<CHANNELS>().0.iter_mut().enumerate() {
                             to.copy_from_slice(&lines.map(|line| line[x]));
                         }
                     }
