@@ -336,12 +336,12 @@ def table(header: str, rows: list[list[str]]) -> str:
 
 
 def of_architecture(folder: Path, name: str) -> Path:
-    """The wheel in a folder for an architecture.
+    """The wheel in a folder for an architecture, with glibc.
 
     Raises:
         Failed: there is none, or more than one.
     """
-    wheels = sorted(folder.glob(f"*_{name}.whl"))
+    wheels = sorted(folder.glob(f"saccade_vla-*-manylinux*_{name}.whl"))
     if len(wheels) != 1:
         raise Failed(f"expected one wheel for {name} in {folder}, got {len(wheels)}")
     return wheels[0]
