@@ -19,10 +19,10 @@ rust)
 python)
     "${pip[@]}" --requirement requirements/audit.txt
     failed=0
-    # One at a time: files of different environments hold different versions.
+    # One at a time: files of different environments hold different versions. A package that cannot be looked up is an error.
     for file in requirements/*.txt; do
         echo "$file"
-        "$folder/bin/pip-audit" --progress-spinner off --disable-pip --no-deps --requirement "$file" || failed=1
+        "$folder/bin/pip-audit" --strict --progress-spinner off --disable-pip --no-deps --requirement "$file" || failed=1
     done
     exit "$failed"
     ;;
