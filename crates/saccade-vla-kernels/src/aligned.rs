@@ -190,6 +190,7 @@ mod tests {
     use super::*;
 
     #[test]
+    #[cfg_attr(miri, ignore = "Miri stops where there is not enough memory")]
     fn memory_that_cannot_be_had_is_an_error() {
         let huge = AlignedBuffer::<f32>::zeroed(usize::MAX / 2);
         assert_eq!(huge.err(), Some(AllocError { bytes: usize::MAX }));
