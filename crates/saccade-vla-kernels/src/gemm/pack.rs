@@ -213,7 +213,9 @@ mod tests {
 
     #[test]
     fn rounding_is_that_of_half() {
-        let near_halves = (0..=u16::MAX).flat_map(|high| {
+        // Miri would take half an hour for all of them.
+        let apart = if cfg!(miri) { 257 } else { 1 };
+        let near_halves = (0..=u16::MAX).step_by(apart).flat_map(|high| {
             let high = u32::from(high) << 16;
             [0, 1, 0x7fff, 0x8000, 0x8001, 0xffff].map(|low| high | low)
         });
