@@ -73,7 +73,9 @@ class Environment:
     def pip(self, *arguments: str | Path) -> None:
         """Installs these, and nothing that they require."""
         options = "--disable-pip-version-check --no-input install --quiet --no-deps --no-build-isolation"
-        self.run("-m", "pip", *options.split(), *arguments, MATURIN_PEP517_ARGS="--locked")
+        # Without build isolation maturin's hook calls the program `maturin`: the one of this environment.
+        path = os.pathsep.join((str(self.folder / PROGRAMS), os.environ["PATH"]))
+        self.run("-m", "pip", *options.split(), *arguments, MATURIN_PEP517_ARGS="--locked", PATH=path)
 
     def install(self, name: str) -> Environment:
         """Installs the packages of requirements/NAME.txt, which is complete."""

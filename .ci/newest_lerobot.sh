@@ -14,6 +14,7 @@ pip=("$folder/bin/python" -m pip --disable-pip-version-check --no-input install 
 "${pip[@]}" --no-deps --requirement "$known"
 "${pip[@]}" --no-deps --requirement requirements/core.txt
 "${pip[@]}" --upgrade lerobot
-"${pip[@]}" --no-deps --no-build-isolation . ./lab ./plugins/lerobot
+# Without build isolation maturin's hook calls the program `maturin`.
+PATH="$PWD/$folder/bin:$PATH" "${pip[@]}" --no-deps --no-build-isolation . ./lab ./plugins/lerobot
 "$folder/bin/python" -m pip list | grep -i '^lerobot '
 exec env OMP_NUM_THREADS=1 "$folder/bin/python" -m pytest tests/compat/policies.py tests/compat/plugin.py

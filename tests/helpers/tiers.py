@@ -28,7 +28,7 @@ PACKAGES = {
     "saccade_lab.random_checkpoint": "core",
     **dict.fromkeys(("benches", "studies", "why_32", "saccade_lab"), "lab"),
     **dict.fromkeys(("gymnasium", "imageio", "joblib", "jinja2", "matplotlib", "mujoco", "pandas"), "lab"),
-    **dict.fromkeys(("metaworld", "ray", "selenium", "sklearn"), "lab"),
+    **dict.fromkeys(("metaworld", "nox", "ray", "selenium", "sklearn"), "lab"),
 }
 #: The least tier of the modules of a folder, and of modules that start programs which import more.
 FOLDERS = {

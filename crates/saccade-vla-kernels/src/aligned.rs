@@ -208,7 +208,7 @@ mod tests {
     #[test]
     fn buffers_of_every_size_are_zero_at_first() {
         let lens = [0, 1, 17, 1 << 10, HUGE_PAGE / 4, HUGE_PAGE];
-        // Miri looks at the elements of a huge page for minutes.
+        // Reading a huge page takes Miri minutes.
         for &len in &lens[..if cfg!(miri) { 4 } else { 6 }] {
             let buffer = AlignedBuffer::<u32>::zeroed(len).unwrap();
             assert!(buffer.iter().all(|&element| element == 0) && buffer.len() == len);

@@ -242,7 +242,7 @@ mod tests {
 
     /// As streams or in order, nearly all of what follows is asked for, and little else.
     #[test]
-    #[cfg_attr(miri, ignore = "it takes minutes, and only counts addresses")]
+    #[cfg_attr(miri, ignore = "takes minutes, and has no unsafe code to check")]
     fn what_comes_next_is_asked_for() {
         for (rows, sizes @ [steps, step_words, part_steps], bursts) in [
             ([49, 7], [1536, 48, 1024], false),
