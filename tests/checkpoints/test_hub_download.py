@@ -126,6 +126,15 @@ def test_a_policy_is_loaded_by_its_id_and_served_with_its_commit(hub: Hub, tmp_p
     assert [Path(source).name for source in sources] == [first, first]
 
 
+def test_a_report_names_id_and_commit(hub: Hub, tmp_path: Path) -> None:
+    commit = hub.repositories[NAME].commit(files_of(Path(saccade.demo_checkpoint())))
+    verify = "from saccade import cli\nraise SystemExit(cli.main(['verify', {!r}, *{!r}]))"
+    text = run(verify.format(NAME, []), hub.endpoint, tmp_path)
+    assert text.stdout.startswith(f"checkpoint  {NAME}@{commit}: GR00T"), text.stderr
+    values = run(verify.format(NAME, ["--json"]), hub.endpoint, tmp_path)
+    assert json.loads(values.stdout)["published"] == f"{NAME}@{commit}", values.stderr
+
+
 def test_statistics_need_no_weights(hub: Hub, tmp_path: Path) -> None:
     load = f"import saccade\nprint(saccade.Normalizer.from_pretrained({NAME!r}, 'gr1'))"
     result = run(load, hub.endpoint, tmp_path)

@@ -14,7 +14,7 @@ from typing import Any, Literal
 
 import saccade._saccade as _saccade
 from saccade._internal.arrays import integer
-from saccade._internal.hub import resolve
+from saccade._internal.hub import locate
 from saccade._internal.hub_files import WEIGHTS
 from saccade.checkpoints.description import Description, Source, description_of, open_published
 from saccade.checkpoints.finite import count_not_finite
@@ -48,6 +48,8 @@ class Verification:
 
     source: str
     """The checkpoint as it was given."""
+    published: str | None = None
+    """The id and commit of a published one, ``owner/name@commit``; None for a path."""
     version: str | None = None
     """The release, such as ``"n1.5"``; None if the checkpoint could not be opened."""
     layout: str | None = None
@@ -124,7 +126,10 @@ def verify(
     seed = integer("seed", seed, least=0)
     say = progress or (lambda text: None)
     found = Verification(os.fspath(source))
-    path = resolve(source, files=WEIGHTS)
+    place = locate(source, files=WEIGHTS)
+    path = place.path
+    if place.id is not None:
+        found.published = f"{place.id}@{place.commit}"
     if not path.exists():
         raise FileNotFoundError(f"{path}: no such checkpoint")
     read = _read(found, source, path, data_config, say)

@@ -92,10 +92,9 @@ def run(args: argparse.Namespace) -> int:
 def report(found: Verification) -> list[str]:
     """The lines of the report."""
     machine = show_config("dicts")
-    name = Path(found.source).resolve().name
+    name = found.published or Path(found.source).resolve().name
     what = "not recognised" if found.version is None else f"GR00T {found.version.upper()}, {found.layout}"
     lines = [
-        f"checkpoint  {name}: {what}",
         f"saccade     {build_of(machine)}",
         f"machine     {machine['cpu']}; {machine['isa']}; {machine['num_threads']} threads",
     ]
@@ -118,7 +117,7 @@ def report(found: Verification) -> list[str]:
         lines += listed("memory", [f"{peak / 1e9:.1f} GB at most, of the whole process"])
     lines += listed("problems", found.problems or ["none"])
     lines.append(f"verdict     {VERDICTS[found.verdict]}")
-    return [without_folder(line, Path(found.source)) for line in lines]
+    return [f"checkpoint  {name}: {what}", *(without_folder(line, Path(found.source)) for line in lines)]
 
 
 def without_folder(text: str, checkpoint: Path) -> str:
