@@ -24,11 +24,11 @@ GITHUB = re.compile(r"https://github\.com/([\w-]+)/([\w.-]+)")
 #: Files with the address.
 ADDRESSED = (
     *("Cargo.toml", "pyproject.toml", "lab/pyproject.toml", "plugins/lerobot/pyproject.toml"),
-    *("CITATION.cff", "README.md"),
+    *("CITATION.cff", "README.md", "CONTRIBUTING.md", ".github/ISSUE_TEMPLATE/config.yml"),
 )
-#: Where pages with instructions to install lie, and those in the root.
+#: Where pages lie that say how to install saccade, or what is true until then, and those in the root.
 FOLDERS = ("docs", "lab", "plugins")
-PAGES = ("README.md",)
+PAGES = ("README.md", "CHANGELOG.md", "CONTRIBUTING.md")
 #: A passage, and in a comment what takes its place.
 PASSAGE = re.compile(
     r"<!-- until it is published -->\n(.*?)<!-- once it is published:\n(.*?)-->\n", re.DOTALL
@@ -62,7 +62,7 @@ def site_of(address: str) -> str:
 
 
 def pages(root: Path) -> list[Path]:
-    """The pages that say how saccade is installed."""
+    """The pages that change when saccade is published."""
     found = (path for folder in FOLDERS for path in sorted((root / folder).rglob("*.md")))
     return [*(root / name for name in PAGES), *found]
 
@@ -110,7 +110,7 @@ def problems(root: Path) -> list[str]:
     for path in pages(root):
         text = path.read_text(encoding="utf-8")
         if MARK.search(text) or installed_from_index(text) != text:
-            found.append(f"{path.relative_to(root).as_posix()}: installs from a clone")
+            found.append(f"{path.relative_to(root).as_posix()}: says what was true before it was published")
     return found
 
 

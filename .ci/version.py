@@ -3,8 +3,8 @@
     python .ci/version.py              prints it
     python .ci/version.py --check      fails if a file says another one
     python .ci/version.py --tag v0.2.0 the same, and the tag and the top of CHANGELOG.md must be of it
-    python .ci/version.py 0.2.0        writes it everywhere, and today in CITATION.cff as the day of release;
-                                       then `cargo check` writes the Cargo.lock files
+    python .ci/version.py 0.2.0        writes it everywhere, and today as its day in CITATION.cff and
+                                       CHANGELOG.md; then `cargo check` writes the Cargo.lock files
 
 A version has three numbers, because Cargo and Python spell pre-releases differently. Package formats want a
 literal version in each file, so it cannot be read from one at build. Needs Python 3.10 and nothing else.
@@ -27,6 +27,7 @@ REPEATED = (
     ("lab/pyproject.toml", r'(?m)^(version = ")([^"]+)(")'),
     ("lab/pyproject.toml", r'("saccade-vla\[cli\]==)([^"]+)(")'),
     ("plugins/lerobot/pyproject.toml", r'(?m)^(version = ")([^"]+)(")'),
+    ("plugins/lerobot/pyproject.toml", r'("saccade-vla==)([^"]+)(")'),
     ("CITATION.cff", r"(?m)^(version: )(\S+)()$"),
 )
 VERSION = re.compile(r"\d+\.\d+\.\d+")
@@ -57,10 +58,10 @@ def problems_of_tag(root: Path, tag: str) -> list[str]:
     """What keeps `tag` from being the tag of this tree's release."""
     version = held(root)
     text = (root / "CHANGELOG.md").read_text(encoding="utf-8")
-    (first, *_) = re.findall(r"(?m)^## (\S+)", text)
+    (first, *_) = re.findall(r"(?m)^## (.+)$", text)
     found = [] if tag == f"v{version}" else [f"tag {tag}, expected v{version}"]
-    if first != version:
-        found.append(f"CHANGELOG.md begins with {first}, expected {version}")
+    if not re.fullmatch(rf"{re.escape(version)} - \d{{4}}-\d{{2}}-\d{{2}}", first):
+        found.append(f"CHANGELOG.md begins with {first}, expected {version} and its day")
     if not DAY.search((root / CITATION).read_text(encoding="utf-8")):
         found.append(f"{CITATION} has no date-released: python .ci/version.py {version} writes it")
     return found
@@ -76,6 +77,10 @@ def write(root: Path, version: str, day: datetime.date) -> None:
     text = DAY.sub("", path.read_text(encoding="utf-8"))
     dated = f"version: {version}\ndate-released: {day.isoformat()}\n"
     path.write_text(text.replace(f"version: {version}\n", dated), encoding="utf-8", newline="\n")
+    path = root / "CHANGELOG.md"
+    heading = rf"(?m)^## {re.escape(version)}( - \S+)?$"
+    text = re.sub(heading, f"## {version} - {day.isoformat()}", path.read_text(encoding="utf-8"))
+    path.write_text(text, encoding="utf-8", newline="\n")
 
 
 def main() -> int:

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import re
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -34,6 +35,14 @@ COMMON = (
     "packages",
     "machine",
 )
+
+#: What LIBERO-PRO changes in a suite, by what it adds to the name.
+PERTURBED = {
+    "swap": "exchanged positions",
+    "task": "another goal",
+    "lan": "other words",
+    "object": "other looks",
+}
 
 
 def record_of(runs: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
@@ -67,15 +76,16 @@ def record_of(runs: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def table(record: Mapping[str, Any]) -> str:
-    """A row for each suite and for each task of the first one, with Wilson's 95 % intervals."""
+    """A row for the first suite, each of its tasks, and each other suite, with Wilson's 95 % intervals."""
     rows = ["| | successes | rate |", "|---|---|---|"]
+    first, *_ = record["suites"]
     for name, suite in record["suites"].items():
         counts = list(suite["tasks"].values())
-        rows.append(
-            row(f"**{name}**", *(sum(one[key] for one in counts) for key in ("successes", "episodes")))
-        )
-    first = next(iter(record["suites"].values()))
-    rows += [row(one["instruction"], one["successes"], one["episodes"]) for one in first["tasks"].values()]
+        perturbed = re.fullmatch(rf"libero_[a-z0-9]+_({'|'.join(PERTURBED)})", name)
+        shown = f"**{name}**" + (f", {PERTURBED[perturbed[1]]}" if perturbed else "")
+        rows.append(row(shown, *(sum(one[key] for one in counts) for key in ("successes", "episodes"))))
+        if name == first:
+            rows += [row(one["instruction"], one["successes"], one["episodes"]) for one in counts]
     return "\n".join(rows)
 
 

@@ -373,8 +373,7 @@ def main() -> int:
         here, _ = check(python, work)
         page = PAGE.read_text().format(
             cpu=f"{here['cpu']}, {here['family']}",
-            commit=commit_of(wheel),
-            arm_commit=commit_of(arm_wheel),
+            commit=" and ".join(sorted({commit_of(wheel), commit_of(arm_wheel)})),
             glibc=inside["glibc"],
             **megabytes,
             versions=table("CPython | NumPy | cross-attention | ", try_versions(wheel, work)),

@@ -31,9 +31,9 @@ def test_suites_are_summed_and_the_first_has_its_tasks() -> None:
     record = libero_rates.record_of([run("libero_object", [40, 50]), run("libero_object_swap", [0, 1])])
     assert libero_rates.table(record).splitlines()[2:] == [
         "| **libero_object** | 90 of 100 | 90 % (83 to 94) |",
-        "| **libero_object_swap** | 1 of 100 | 1 % (0 to 5) |",
         "| libero_object 0 | 40 of 50 | 80 % (67 to 89) |",
         "| libero_object 1 | 50 of 50 | 100 % (93 to 100) |",
+        "| **libero_object_swap**, exchanged positions | 1 of 100 | 1 % (0 to 5) |",
     ]
 
 

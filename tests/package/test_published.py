@@ -91,7 +91,7 @@ def test_a_file_that_was_left_behind_is_named(program: ModuleType, tree: Path) -
     assert program.problems(tree) == [
         f"CITATION.cff: expected the address {ADDRESS}",
         "CITATION.cff: holds an address that does not exist",
-        "docs/tutorial.md: installs from a clone",
+        "docs/tutorial.md: says what was true before it was published",
     ]
 
 

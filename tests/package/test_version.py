@@ -82,15 +82,19 @@ def test_a_tag_is_of_the_version_and_the_changelog_begins_with_it(program: Modul
     changelog = tree / "CHANGELOG.md"
     changelog.write_text("# Changelog\n\n## Unreleased\n\n" + changelog.read_text())
     assert program.problems_of_tag(tree, f"v{version}") == [
-        f"CHANGELOG.md begins with Unreleased, expected {version}"
+        f"CHANGELOG.md begins with Unreleased, expected {version} and its day"
     ]
 
 
 def test_a_release_has_a_day(program: ModuleType, tree: Path) -> None:
-    version, citation = program.held(tree), tree / "CITATION.cff"
+    version, citation, changelog = program.held(tree), tree / "CITATION.cff", tree / "CHANGELOG.md"
+    program.write(tree, version, datetime.date(2027, 1, 2))
+    assert f"\n## {version} - 2027-01-02\n" in changelog.read_text()
     citation.write_text(program.DAY.sub("", citation.read_text()))
-    (problem,) = program.problems_of_tag(tree, f"v{version}")
-    assert problem.startswith("CITATION.cff has no date-released")
+    changelog.write_text(changelog.read_text().replace(" - 2027-01-02", ""))
+    first, second = program.problems_of_tag(tree, f"v{version}")
+    assert first == f"CHANGELOG.md begins with {version}, expected {version} and its day"
+    assert second.startswith("CITATION.cff has no date-released")
 
 
 @pytest.mark.parametrize("words", [["1.2"], ["v1.2.3"], ["1.2.3rc1"], ["1.2.3-rc.1"], ["1.2.3", "--check"]])
