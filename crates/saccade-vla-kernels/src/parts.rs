@@ -78,8 +78,8 @@ mod tests {
     #[test]
     fn every_row_is_in_one_part() {
         let large = if cfg!(miri) { 1024 } else { 4096 };
-        assert_eq!(threads_and_tasks(3, 100, large, 100).0, 3);
-        for (rows, width) in [(0, 3), (5, 0), (1, 1), (7, 3), (100, large), (large, 100)] {
+        assert_eq!(threads_and_tasks(3, 64, large, 64).0, 3);
+        for (rows, width) in [(0, 3), (5, 0), (1, 1), (7, 3), (64, large), (large, 64)] {
             let mut data = vec![0; rows * width];
             parallel_rows(
                 3,
