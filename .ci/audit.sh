@@ -21,7 +21,7 @@ python)
     failed=0
     # pip-audit leaves out what this system does not install, so markers go; of a package with several versions each is in a
     # list of its own, because a list may name it once. A package that cannot be looked up is an error.
-    sed -n 's/^\([A-Za-z0-9._-]*==[^ ;]*\).*/\1/p' requirements/*.txt | sort --unique |
+    sed -e '/^#/d' -e 's/ *;.*//' requirements/*.txt | sort --unique |
         awk -F== -v folder="$folder" '{ print > (folder "/versions-" ++count[$1] ".txt") }'
     for file in "$folder"/versions-*.txt; do
         "$folder/bin/pip-audit" --strict --progress-spinner off --disable-pip --no-deps --requirement "$file" || failed=1

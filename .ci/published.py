@@ -26,7 +26,7 @@ ADDRESSED = (
     *("Cargo.toml", "pyproject.toml", "lab/pyproject.toml", "plugins/lerobot/pyproject.toml"),
     *("CITATION.cff", "README.md", "CONTRIBUTING.md", ".github/ISSUE_TEMPLATE/config.yml"),
 )
-#: Where pages lie that say how to install saccade, or what is true until then, and those in the root.
+#: Where pages lie that change when saccade is published, and those in the root.
 FOLDERS = ("docs", "lab", "plugins")
 PAGES = ("README.md", "CHANGELOG.md", "CONTRIBUTING.md")
 #: A passage, and in a comment what takes its place.

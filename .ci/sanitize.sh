@@ -46,7 +46,7 @@ portable() (
 # for a leak.
 miri() (
     cargo +nightly miri --version >/dev/null 2>&1 || fail "needs Miri: rustup toolchain install nightly --component miri"
-    export RUSTFLAGS="--cfg saccade_portable" MIRIFLAGS="-Zmiri-disable-isolation -Zmiri-ignore-leaks" SACCADE_TEST_EMULATED=1
+    export RUSTFLAGS="--cfg saccade_portable" MIRIFLAGS="-Zmiri-disable-isolation -Zmiri-ignore-leaks"
     cargo +nightly miri test --locked --package saccade-vla-kernels --lib --target-dir target/miri
 )
 

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import re
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -21,6 +20,7 @@ from benches.pages.report import require_commit
 from benches.peers import machine
 from saccade._internal.files import write_json
 from saccade_lab.intervals import wilson
+from saccade_lab.libero.suites import SUITES
 
 RECORD = Path(__file__).parent / "results" / "libero-rates.json"
 
@@ -36,7 +36,7 @@ COMMON = (
     "machine",
 )
 
-#: What LIBERO-PRO changes in a suite, by what it adds to the name.
+#: What the perturbations of LIBERO-PRO change.
 PERTURBED = {
     "swap": "exchanged positions",
     "task": "another goal",
@@ -81,8 +81,8 @@ def table(record: Mapping[str, Any]) -> str:
     first, *_ = record["suites"]
     for name, suite in record["suites"].items():
         counts = list(suite["tasks"].values())
-        perturbed = re.fullmatch(rf"libero_[a-z0-9]+_({'|'.join(PERTURBED)})", name)
-        shown = f"**{name}**" + (f", {PERTURBED[perturbed[1]]}" if perturbed else "")
+        perturbed = PERTURBED.get(name.removeprefix(f"{SUITES[name].base}_"))
+        shown = f"**{name}**" + (f", {perturbed}" if perturbed else "")
         rows.append(row(shown, *(sum(one[key] for one in counts) for key in ("successes", "episodes"))))
         if name == first:
             rows += [row(one["instruction"], one["successes"], one["episodes"]) for one in counts]

@@ -38,6 +38,11 @@ class Location(os.PathLike[str]):
     commit: str | None = None
     """The commit that ``revision`` named when it was resolved; None for a local path."""
 
+    @property
+    def published(self) -> str | None:
+        """Id and commit, ``owner/name@commit``; None for a local path."""
+        return None if self.id is None else f"{self.id}@{self.commit}"
+
     def __fspath__(self) -> str:
         return os.fspath(self.path)
 

@@ -125,14 +125,12 @@ def verify(
     """
     seed = integer("seed", seed, least=0)
     say = progress or (lambda text: None)
-    found = Verification(os.fspath(source))
     place = locate(source, files=WEIGHTS)
     path = place.path
-    if place.id is not None:
-        found.published = f"{place.id}@{place.commit}"
+    found = Verification(os.fspath(source), place.published)
     if not path.exists():
         raise FileNotFoundError(f"{path}: no such checkpoint")
-    read = _read(found, source, path, data_config, say)
+    read = _read(found, path, data_config, say)
     if read is None or found.problems:
         return found
     published, has_backbone = read
@@ -172,7 +170,6 @@ def verify(
 
 def _read(
     found: Verification,
-    source: Source,
     path: Path,
     data_config: DataConfigLike | None,
     say: Callable[[str], object],
@@ -180,11 +177,11 @@ def _read(
     """Checks the files; what opened them, and whether there is a backbone. None if they cannot be read."""
     say("names, shapes and types of the tensors")
     try:
-        published = open_published(source)
+        published = open_published(path)
     except SaccadeError as error:
         found.problems += lines_of(error)
         return None
-    description = description_of(published, source)
+    description = description_of(published, path)
     found.version, found.layout = description.version, description.layout
     has_backbone = _check_tensors(found, published, description, path)
     say("values of the tensors")

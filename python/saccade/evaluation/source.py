@@ -59,8 +59,7 @@ class Source:
                 )
             recordings = f"{published[0]}@{commit}"
         found = locate(checkpoint)
-        name = None if found.id is None else f"{found.id}@{found.commit}"
-        return cls(str(found.path), recordings, values, name)
+        return cls(str(found.path), recordings, values, found.published)
 
     @property
     def policy(self) -> Policy:
