@@ -18,6 +18,7 @@ from pathlib import Path
 import nox
 
 sys.path.insert(0, str(Path(__file__).resolve().parent / ".ci"))
+import peers
 from environments import ENVIRONMENTS, ROOT, Environment, digest, needs, working
 
 nox.needs_version = ">=2025.2"
@@ -179,29 +180,15 @@ def bench(session: nox.Session) -> None:
 
 @nox.session(name="bench-peers")
 def bench_peers(session: nox.Session) -> None:
-    """Compare with other engines that run the same head, or with `--only policy` the whole policy."""
+    """Compare with other engines that run the same head, or with `--only policy` the whole policy.
+
+    The whole policy is measured for N1.5 with lerobot 0.4.4 and for N1.7 with lerobot 0.6.1, unless
+    `--release` names one. The latter needs Python 3.12: `python3.12` on PATH, or SACCADE_PYTHON312.
+    """
     needs(session, "python", "rust")
-    folder = ENVIRONMENTS / "peers"
-    environment = Environment(session, folder).install("peers").install_saccade().install_lab()
-    scripts = ROOT / "benches" / "peers"
-    made_from = digest([scripts / "build_ggml.sh"])
-    if not environment.is_done("ggml", made_from):
-        # It is optional: without it, the report has no rows of ggml and says so.
-        print("setup: ggml, as llama-cpp-python ships it (takes minutes)", flush=True)
-        session.run(
-            "sh", str(scripts / "build_ggml.sh"), str(folder), external=True, success_codes=range(256)
-        )
-        environment.done("ggml", made_from)
-    source = os.environ.get("VLA_SOURCE", "")
-    made_from = digest([scripts / "build_vla.sh"]) + source
-    if source and not environment.is_done("vla", made_from):
-        session.run("sh", str(scripts / "build_vla.sh"), str(folder), source, external=True)
-        environment.done("vla", made_from)
-    variables = {
-        "SACCADE_PEERS_GGML": str(folder / "ggml/build/bin"),
-        "SACCADE_PEERS_VLA": str(folder / "vla"),
-    }
-    environment.run("-m", "benches.peers", *session.posargs, **variables)
+    for release in peers.releases(session.posargs):
+        environment, variables = peers.environment_of(session, release)
+        environment.run("-m", "benches.peers", *session.posargs, "--release", release, **variables)
 
 
 @nox.session

@@ -39,9 +39,10 @@ class Environment:
     Args:
         session: The task that needs it.
         folder: Where it is, or is to be created.
+        python: The interpreter that creates it.
     """
 
-    def __init__(self, session: nox.Session, folder: Path) -> None:
+    def __init__(self, session: nox.Session, folder: Path, python: str = sys.executable) -> None:
         self.session = session
         self.folder = folder
         self.python = folder / PROGRAMS / PYTHON
@@ -50,7 +51,7 @@ class Environment:
         command = [str(self.python), "-c", "import sys; print(sys.prefix)"]
         said = session.run(*command, silent=True, external=True, log=False) if self.python.exists() else ""
         if str(said).strip() != str(folder):
-            session.run(sys.executable, "-m", "venv", "--clear", str(folder), external=True, log=False)
+            session.run(python, "-m", "venv", "--clear", str(folder), external=True, log=False)
         self.steps: dict[str, str] = json.loads(self.note.read_text()) if self.note.exists() else {}
 
     def program(self, name: str) -> str:
@@ -77,12 +78,12 @@ class Environment:
         path = os.pathsep.join((str(self.folder / PROGRAMS), os.environ["PATH"]))
         self.run("-m", "pip", *options.split(), *arguments, MATURIN_PEP517_ARGS="--locked", PATH=path)
 
-    def install(self, name: str) -> Environment:
-        """Installs the packages of requirements/NAME.txt, which is complete."""
-        file = ROOT / "requirements" / f"{name}.txt"
+    def install(self, name: str, folder: str = "requirements") -> Environment:
+        """Installs the packages of FOLDER/NAME.txt, which is complete."""
+        file = ROOT / folder / f"{name}.txt"
         made_from = digest([file])
         if not self.is_done(name, made_from):
-            print(f"setup: requirements/{file.name} (takes minutes the first time)", flush=True)
+            print(f"setup: {folder}/{file.name} (takes minutes the first time)", flush=True)
             self.pip("--requirement", file)
             self.done(name, made_from)
         return self

@@ -26,7 +26,8 @@ OLDEST_PYTHON = "3.10"
 #: Distribution -> its pyproject.toml.
 PROJECTS = {"saccade-vla": ROOT / "pyproject.toml", "saccade-vla-lab": ROOT / "lab" / "pyproject.toml"}
 #: File -> the distributions with their extras, and the groups of pyproject.toml, that it serves. dev comes
-#: first: its versions hold for the others. That of wheels is apart, because what it has was tested together.
+#: first: its versions hold for the others, except those apart: wheels, because what it has was tested
+#: together, and peers-n17, because another lerobot needs other versions.
 FILES: dict[str, tuple[list[str], list[str]]] = {
     "dev": (["saccade-vla[serve,torch,hub,data]", "saccade-vla-lab[study]"], ["dev"]),
     "nox": ([], ["nox"]),
@@ -35,6 +36,7 @@ FILES: dict[str, tuple[list[str], list[str]]] = {
     "ray": (["saccade-vla[data]", "saccade-vla-lab[ray]"], ["build", "test", "measured"]),
     "libero": (["saccade-vla[data]", "saccade-vla-lab[libero]"], ["build", "test"]),
     "peers": ([], ["peers"]),
+    "peers-n17": ([], ["peers-n17"]),
     "rounding": (["saccade-vla"], ["rounding"]),
     "lock": ([], ["lock"]),
     "docs": ([], ["docs"]),
@@ -43,7 +45,7 @@ FILES: dict[str, tuple[list[str], list[str]]] = {
     "metadata": ([], ["metadata"]),
     "wheels": ([], ["wheels"]),
 }
-APART = ("dev", "wheels")
+APART = ("dev", "wheels", "peers-n17")
 #: Packages whose own requirements are not installed, so that they are not resolved. Parity is tested against
 #: the released head; of the trained model the weights are read, as data.
 RELEASED_HEAD = "lerobot==0.4.4"

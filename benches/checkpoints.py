@@ -20,15 +20,25 @@ def n15(work: Path, *, small: bool, given: Path | None = None) -> Path:
     Raises:
         SystemExit: There is no checkpoint where one was given.
     """
-    if given is not None:
-        return existing(given)
+    return random_policy(work, "n1.5", small=small) if given is None else existing(given)
+
+
+def random_policy(work: Path, version: str, *, small: bool) -> Path:
+    """A whole random checkpoint.
+
+    Args:
+        work: Folder that keeps it as `n15`, `n17` or the like, 5 to 6 GB, small ones as `n15-small`.
+        version: `"n1.5"`, `"n1.6"` or `"n1.7"`.
+        small: Small sizes, for a quick trial.
+    """
+    name = version.replace(".", "")
     if small:
         sizes = {
-            "backbone": random_checkpoint.small_backbone("n1.5"),
-            "head": random_checkpoint.small_head("n1.5"),
+            "backbone": random_checkpoint.small_backbone(version),
+            "head": random_checkpoint.small_head(version),
         }
-        return written(work / "n15-small", **sizes)
-    return written(work / "n15")
+        return written(work / f"{name}-small", version=version, **sizes)
+    return written(work / name, version=version)
 
 
 def existing(folder: Path) -> Path:

@@ -6,7 +6,8 @@
     make bench-peers PEERS_ARGS="--only cost"              how saccade's time grows with its sizes
     make bench-peers PEERS_ARGS="--only throughput --rounds 3 --minutes 120"
                        chunks per second of 1, 8 and 32 observations at once, on 1 thread to all cores
-    make bench-peers PEERS_ARGS="--only policy"            the whole policy, images and instruction to a chunk
+    make bench-peers PEERS_ARGS="--only policy"            the whole policy, images and instruction to a
+                       chunk: N1.5, then N1.7; --release n1.7 measures that one alone
     python -m benches.peers report                         write the report of existing measurements
     python -m benches.peers report --write                 write docs/results/performance.md and its figures
     python -m benches.peers report --only policy --write   write docs/results/policy-speed.md
@@ -16,7 +17,7 @@ works. In a round, each does every piece of work once, in an order that rotates.
 result is compared with the reference in float32. What has a target comes first. Measurements are added to a
 JSON file, so an interrupted run resumes, and contenders that have all their rounds are not started again.
 At the end the file is copied to benches/peers/results/ under the name of the CPU's family. The whole policy
-is measured apart from the head, and has a file, a record and a page of its own.
+is measured apart from the head, and each release has a file and a record of its own; they share a page.
 
 Needs the environment that `make bench-peers` sets up. A contender whose package is missing is left out, with
 the reason in the report. The whole head in all contenders takes 12 GB of memory, the whole policy 19 GB;
@@ -38,7 +39,7 @@ from typing import Any
 
 from benches.pages.report import require_commit
 from benches.peers import machine, policy_report, processes, report
-from benches.peers.cases import USUAL, WHOLE, WORKS, Case, default_cases, full_cases
+from benches.peers.cases import RELEASES, USUAL, WHOLE, WORKS, Case, default_cases, full_cases
 from benches.peers.contenders import CONTENDERS, GROUPS, POLICY_GROUPS, PROCESSES, able
 from benches.peers.goals import NEEDED
 from benches.peers.processes import KilledError, Ready, note
@@ -66,7 +67,7 @@ def main(arguments: list[str] | None = None) -> int:
     measure_all(results, args)
     if not args.prepare:
         reporter.write(results, args.results.parent)
-        keep(results, args.record)
+        keep(results, args.record / args.release if args.only == ["policy"] else args.record)
     return 0
 
 
@@ -108,7 +109,7 @@ def keep(results: Results, folder: Path) -> None:
     """Copies the measurements to the record of this CPU's family, if the whole head or policy is among
     them. Those of a tree with uncommitted changes are refused.
     """
-    if usual(results, "head") or usual(results, "policy"):
+    if usual(results, "head") or any(usual(results, "policy", release) for release in RELEASES):
         require_commit(results.data, results.path)
         path = folder / f"{results.slug}.json"
         results.save(path)
@@ -123,7 +124,8 @@ def chosen_cases(args: argparse.Namespace) -> list[Case]:
         for name in (flag.replace("-", "_") for flag in SIZES)
         if getattr(args, name) is not None
     }
-    cases = [replace(case, size=args.size, **changed) for case in cases if case.piece in args.only]
+    changed |= {"size": args.size, "release": args.release}
+    cases = [replace(case, **changed) for case in cases if case.piece in args.only]
     return list(dict.fromkeys(cases))
 
 
@@ -208,6 +210,9 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
         help=f"of {', '.join(WORKS)} (default: {', '.join(USUAL)}; with --full all but policy)",
     )
     parser.add_argument(
+        "--release", choices=RELEASES, default=RELEASES[0], help="of the whole policy (default n1.5)"
+    )
+    parser.add_argument(
         "--contenders",
         nargs="+",
         choices=CONTENDERS,
@@ -249,12 +254,15 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
         "--work", type=Path, default=Path("out/peers"), help="weights and graphs (default out/peers)"
     )
     parser.add_argument(
-        "--results", type=Path, help="the JSON file (default: results.json in --work; of policy policy.json)"
+        "--results",
+        type=Path,
+        help="the JSON file (default: results.json in --work; of policy policy-RELEASE.json)",
     )
     parser.add_argument(
         "--record",
         type=Path,
-        help="folder with a JSON file per CPU family (default benches/peers/results; of policy policy in it)",
+        help="folder with a JSON file per CPU family (default benches/peers/results), of policy one with "
+        "such a folder for each release (default: policy in it)",
     )
     parser.add_argument("--write", action="store_true", help="report: write the page in docs from --record")
     args = parser.parse_args(arguments)
@@ -265,8 +273,12 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
     given = [f"--{name}" for name in SIZES if getattr(args, name.replace("-", "_")) is not None]
     if is_policy and given:
         parser.error(f"{', '.join(given)}: not with --only policy, whose sizes are those of its checkpoint")
-    args.results = args.results or args.work / ("policy.json" if is_policy else "results.json")
-    args.record = args.record or (RECORDS / "policy" if is_policy else RECORDS)
+    if args.release != RELEASES[0] and not is_policy:
+        parser.error(f"--release {args.release}: only with --only policy")
+    args.results = args.results or args.work / (
+        f"policy-{args.release}.json" if is_policy else "results.json"
+    )
+    args.record = args.record or (policy_report.RECORDS if is_policy else RECORDS)
     args.threads = args.threads or default_threads(args.only)
     memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 1e9
     args.memory = args.memory or (min(19.0, 0.8 * memory) if is_policy else min(12.0, 0.6 * memory))

@@ -1,14 +1,14 @@
 #!/bin/sh
-# Builds the library of vla.cpp from a clone, against the ggml that build_ggml.sh built: build_vla.sh ENVIRONMENT
-# CLONE. The library, its converter and Python's gguf are written to ENVIRONMENT/vla. Its server, which needs
+# Builds the library of vla.cpp from a clone, against the ggml that build_ggml.sh built: build_vla.sh FOLDER
+# CLONE. The library, its scripts and Python's gguf are written to FOLDER/vla. Its server, which needs
 # ZeroMQ and protobuf, is not built.
 set -eu
-environment=$(cd "$1" && pwd)
+folder=$(cd "$1" && pwd)
 clone=$(cd "$2" && pwd)
-llama="$environment/ggml/source/vendor/llama.cpp"
-libraries="$environment/ggml/build/bin"
-rm -rf "$environment/vla" && mkdir -p "$environment/vla/objects"
-cd "$environment/vla"
+llama="$folder/ggml/source/vendor/llama.cpp"
+libraries="$folder/ggml/build/bin"
+rm -rf "$folder/vla" && mkdir -p "$folder/vla/objects"
+cd "$folder/vla"
 for source in model loader options vla_c_api modules/* models/*; do
     for file in "$clone"/src/${source%.*}.cpp; do
         [ -e "$file" ] || continue
@@ -21,4 +21,5 @@ for source in model loader options vla_c_api modules/* models/*; do
 done
 c++ -shared -o libvla.so objects/*.o -L "$libraries" -lggml -lggml-base -lggml-cpu "-Wl,-rpath,$libraries"
 cp -r "$clone/scripts" scripts
+echo "commit $(git -C "$clone" rev-parse --short HEAD), $(basename "$folder"/ggml/llama_cpp_python-*.tar.gz .tar.gz)" >version.txt
 cp -r "$llama/gguf-py" gguf-py

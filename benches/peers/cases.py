@@ -42,6 +42,8 @@ USUAL = ("head", "blocks", "cross", "linear")
 """The pieces of a run that names none: all but the cost model and throughput."""
 WHOLE = ("head", "throughput", "cost")
 """The pieces that are the whole head."""
+RELEASES = ("n1.5", "n1.7")
+"""The releases whose whole policy is measured."""
 BATCHES = (1, 8, 32)
 """Observations of the piece `throughput`."""
 
@@ -60,7 +62,8 @@ class Case:
         batch: Observations.
         samples: Chunks for each observation.
         steps: Euler steps (of the whole head).
-        size: `full` (N1.5) or `small` (to see that it works).
+        size: `full` (as published) or `small` (to see that it works).
+        release: Of the whole policy `n1.5` or `n1.7`; the head is N1.5's.
     """
 
     piece: str
@@ -71,6 +74,7 @@ class Case:
     samples: int = 1
     steps: int = 4
     size: str = "full"
+    release: str = "n1.5"
 
     @property
     def works(self) -> tuple[str, ...]:
@@ -88,7 +92,7 @@ class Case:
 
     def __str__(self) -> str:
         if self.piece == "policy":
-            return f"policy, {self.threads} threads"
+            return f"policy {self.release.upper()}, {self.threads} threads"
         return (
             f"{self.piece} T_vl {self.num_vl_tokens} N {self.num_future_tokens} batch {self.batch} "
             f"samples {self.samples} steps {self.steps}, {self.threads} threads"

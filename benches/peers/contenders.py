@@ -153,64 +153,53 @@ def _policy(label: str, engine: str, gigabytes: float, process: str = "", **opti
     return Contender(label, engine, ("policy",), gigabytes, options, process=process)
 
 
+def _saccade_policy(precision: str, gigabytes: float) -> Contender:
+    return _policy(f"saccade {precision}", "saccade_policy", gigabytes, precision=precision)
+
+
+def _lerobot(setting: str, arithmetic: str, gigabytes: float = 0.5, **options: Any) -> Contender:
+    process = f"lerobot-{arithmetic}"
+    return _policy(
+        f"lerobot {setting}", "lerobot_policy", gigabytes, process, arithmetic=arithmetic, **options
+    )
+
+
+def _graphs(label: str, opened_by: str, gigabytes: float, arithmetic: str) -> Contender:
+    return _policy(label, "policy_graphs", gigabytes, opened_by=opened_by, arithmetic=arithmetic)
+
+
 POLICY_GROUPS: Mapping[str, Mapping[str, Contender]] = {
     "narrow": {
-        "policy-saccade-bfloat16": _policy("saccade bfloat16", "saccade_policy", 4.5, precision="bfloat16"),
-        "policy-saccade-int8": _policy("saccade int8", "saccade_policy", 2.6, precision="int8"),
-        "policy-lerobot-bfloat16-pure": _policy(
-            "lerobot 0.4.4 bfloat16, no autocast",
-            "lerobot_policy",
-            0.5,
-            "lerobot-bfloat16",
-            arithmetic="bfloat16",
+        "policy-saccade-bfloat16": _saccade_policy("bfloat16", 4.5),
+        "policy-saccade-int8": _saccade_policy("int8", 2.6),
+        "policy-lerobot-bfloat16-pure": _lerobot("bfloat16, no autocast", "bfloat16"),
+        "policy-accelerate-bfloat16": _lerobot(
+            "bfloat16, accelerate(policy, backbone=True)", "bfloat16", 4.8, accelerated="bfloat16"
         ),
-        "policy-accelerate-bfloat16": _policy(
-            "lerobot 0.4.4 bfloat16, accelerate(policy, backbone=True)",
-            "lerobot_policy",
-            5.0,
-            "lerobot-bfloat16",
-            arithmetic="bfloat16",
-            accelerated="bfloat16",
-        ),
-        "policy-lerobot-bfloat16": _policy(
-            "lerobot 0.4.4 bfloat16 weights, autocast",
-            "lerobot_policy",
-            0.5,
-            "lerobot-bfloat16",
-            arithmetic="bfloat16",
-            autocast=True,
-        ),
+        "policy-lerobot-bfloat16": _lerobot("bfloat16 weights, autocast", "bfloat16", autocast=True),
+        "policy-compile-bfloat16": _lerobot("bfloat16, torch.compile", "bfloat16", 1.0, compiled=True),
+        "policy-saccade-int4": _saccade_policy("int4", 1.6),
     },
     "float32": {
-        "policy-saccade-float32": _policy("saccade float32", "saccade_policy", 5.5, precision="float32"),
-        "policy-lerobot-default": _policy(
-            "lerobot 0.4.4, its default: float32 weights, autocast to bfloat16",
-            "lerobot_policy",
-            0.5,
-            "lerobot-float32",
-            arithmetic="float32",
-            autocast=True,
+        "policy-saccade-float32": _saccade_policy("float32", 5.5),
+        "policy-lerobot-default": _lerobot(
+            "default: float32 weights, autocast to bfloat16", "float32", autocast=True
         ),
-        "policy-lerobot-float32": _policy(
-            "lerobot 0.4.4 float32", "lerobot_policy", 0.5, "lerobot-float32", arithmetic="float32"
-        ),
+        "policy-lerobot-float32": _lerobot("float32", "float32"),
     },
     "graphs": {
-        "policy-openvino-bfloat16": _policy(
-            "OpenVINO bfloat16", "policy_graphs", 6.0, opened_by="open_vino", arithmetic="bfloat16"
-        ),
-        "policy-vla-bfloat16": _policy("vla.cpp bfloat16", "vla_cpp", 5.5),
-        "policy-onnxruntime-int8": _policy(
-            "ONNX Runtime int8, dynamic", "policy_graphs", 6.0, opened_by="onnx_runtime", arithmetic="int8"
-        ),
+        "policy-openvino-bfloat16": _graphs("OpenVINO bfloat16", "open_vino", 6.0, "bfloat16"),
+        "policy-openvino-int8": _graphs("OpenVINO int8 weights (NNCF)", "open_vino", 4.0, "int8"),
+        "policy-onnxruntime-int8": _graphs("ONNX Runtime int8, dynamic", "onnx_runtime", 6.0, "int8"),
+    },
+    "ggml": {
+        "policy-vla-bfloat16": _policy("vla.cpp BF16", "vla_cpp", 5.5, weights="BF16"),
+        "policy-vla-int8": _policy("vla.cpp Q8_0", "vla_cpp", 3.5, weights="Q8_0"),
+        "policy-vla-int4": _policy("vla.cpp Q4_0", "vla_cpp", 3.0, weights="Q4_0"),
     },
     "float32 graphs": {
-        "policy-openvino-float32": _policy(
-            "OpenVINO float32", "policy_graphs", 9.0, opened_by="open_vino", arithmetic="float32"
-        ),
-        "policy-onnxruntime-float32": _policy(
-            "ONNX Runtime float32", "policy_graphs", 9.0, opened_by="onnx_runtime", arithmetic="float32"
-        ),
+        "policy-openvino-float32": _graphs("OpenVINO float32", "open_vino", 9.0, "float32"),
+        "policy-onnxruntime-float32": _graphs("ONNX Runtime float32", "onnx_runtime", 9.0, "float32"),
     },
 }
 """Those that run the whole policy, in the same way. What matters most comes first."""

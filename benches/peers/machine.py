@@ -17,7 +17,17 @@ import saccade
 ROOT = Path(__file__).resolve().parents[2]
 FLAGS = ("avx2", "fma", "f16c", "avx_vnni", "avx512f", "avx512bw", "avx512vl", "avx512_vnni", "avx512_bf16")
 AMX = ("amx_tile", "amx_bf16", "amx_int8")
-PACKAGES = ("saccade", "torch", "lerobot", "transformers", "diffusers", "onnxruntime", "openvino", "numpy")
+PACKAGES = (
+    "saccade",
+    "torch",
+    "lerobot",
+    "transformers",
+    "diffusers",
+    "onnxruntime",
+    "openvino",
+    "nncf",
+    "numpy",
+)
 
 
 TIMING = "rest, warm-up"

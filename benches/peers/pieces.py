@@ -21,6 +21,8 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from saccade_lab.reference import ActionHead, tables
+from saccade_lab.reference.backbone import attention as backbone_attention
+from saccade_lab.reference.backbone.rotary import rotate
 
 Modules = Any  # reference modules, whose attributes torch does not type
 
@@ -65,9 +67,13 @@ class Project(nn.Module):
 
     def forward(self, features: Tensor) -> tuple[Tensor, ...]:
         """`(B, T_vl, C)` to keys, values of the first, of the second, ...: `(B, heads, T_vl, head_dim)`."""
+        return self.of([features] * len(self.to_kv))
+
+    def of(self, features: list[Tensor]) -> tuple[Tensor, ...]:
+        """The same of each attention's own features."""
         held: list[Tensor] = []
-        for layer in self.to_kv:
-            held += [split_heads(half, self.num_heads) for half in layer(features).chunk(2, dim=-1)]
+        for layer, own in zip(self.to_kv, features, strict=True):
+            held += [split_heads(half, self.num_heads) for half in layer(own).chunk(2, dim=-1)]
         return tuple(held)
 
 
@@ -179,6 +185,20 @@ class VlBlock(nn.Module):
         return x + self.down(F.gelu(self.up(self.norm3(x)), approximate="tanh"))
 
 
+def decoder_layer(layer: Modules, x: Tensor, angles: Tensor, head_dim: int) -> Tensor:
+    """A layer of Qwen3 for one prompt without padding: `(1, T, width)`, `(T, head_dim / 2)`."""
+    attention, y = layer.self_attn, layer.input_layernorm(x)
+    q, k, v = (
+        backbone_attention.split_heads(projection(y), head_dim)
+        for projection in (attention.q_proj, attention.k_proj, attention.v_proj)
+    )
+    q, k = rotate(attention.q_norm(q), angles), rotate(attention.k_norm(k), angles)
+    k, v = (each.repeat_interleave(attention.queries_per_key, dim=1) for each in (k, v))
+    attended = F.scaled_dot_product_attention(q, k, v, is_causal=True)
+    x = x + attention.o_proj(attended.transpose(1, 2).flatten(2))
+    return x + layer.mlp(layer.post_attention_layernorm(x))
+
+
 class State(nn.Module):
     """The state row, once a chunk."""
 
@@ -205,7 +225,7 @@ class Step(nn.Module):
         self.into = nn.Linear(config.encoder_action_dim, config.width, bias=False, device="meta")
         self.into.weight = frozen((encoder.W1.W[embodiment].double() @ half.double()).float().T)
         self.out_of = of_category(encoder.W3, embodiment)
-        self.future = frozen(modules.future_tokens.weight)
+        self.future = frozen(head.learned_tokens)
         self.positions = frozen(modules.position_embedding.weight[: config.action_horizon])
         last = config.num_layers - 1
         self.blocks = nn.ModuleList(
@@ -223,8 +243,10 @@ class Step(nn.Module):
         `times` gives them; the velocity `(B S, T, A)`.
         """
         action_rows = self.out_of(F.silu(self.into(actions) + time)) + self.positions
-        future = self.future.expand(actions.shape[0], -1, -1)
-        rows = torch.cat((state_row, future.to(state_row.dtype), action_rows.to(state_row.dtype)), dim=1)
+        parts = [state_row, action_rows.to(state_row.dtype)]
+        if len(self.future):  # N1.7 has none
+            parts.insert(1, self.future.expand(actions.shape[0], -1, -1).to(state_row.dtype))
+        rows = torch.cat(parts, dim=1)
         for index, block in enumerate(self.blocks):
             own = held[index : index + 2] if block.is_cross else ()
             rows = block(rows, modulations[index], self.samples, *own)

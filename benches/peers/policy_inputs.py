@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benches.backbone.setup import INSTRUCTION_TEXT
-from benches.checkpoints import n15
+from benches.checkpoints import random_policy
 from benches.peers.cases import WORKS, Case
 from saccade.observations import Requirements
 
@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 Arrays = dict[str, NDArray[Any]]
 VIEWS = tuple(int(work.split()[0]) for work in WORKS["policy"])
 """Cameras of each work."""
+STEPS = 4
+"""Euler steps of a chunk."""
 
 
 @dataclass(frozen=True)
@@ -27,7 +29,8 @@ class Given:
     """What is given to a policy that sees so many cameras.
 
     Attributes:
-        pixels: float32 `(views, 3, side, side)`.
+        pixels: float32 `(views, 3, side, side)`. N1.7: patches, `(views * patches of a view, values)`.
+        grids: Time, height and width of each view's grid of patches, `(views, 3)`. N1.5: None.
         ids: int64 `(1, T_vl)`.
         state: Normalised, float32 `(1, 1, state_dim)`.
         noise: float32 `(1, horizon, action_dim)`.
@@ -35,6 +38,7 @@ class Given:
     """
 
     pixels: NDArray[np.float32]
+    grids: NDArray[np.int64] | None
     ids: NDArray[np.int64]
     state: NDArray[np.float32]
     noise: NDArray[np.float32]
@@ -45,6 +49,7 @@ def given(arrays: Arrays, views: int) -> Given:
     """What `expected_of` holds for so many cameras."""
     return Given(
         arrays[f"pixels{views}"],
+        arrays.get(f"grids{views}"),
         arrays[f"ids{views}"],
         arrays["state"],
         arrays["noise"],
@@ -72,7 +77,9 @@ def with_views(policy: saccade.Policy, views: int) -> saccade.Policy:
 
 
 def observation_of(policy: saccade.Policy) -> dict[str, Any]:
-    """Random frames, a state in the middle of its range, and the usual instruction."""
+    """Random frames of the size that the policy expects, a state in the middle of its range, and the usual
+    instruction.
+    """
     observation = policy.example_observation()
     return {**observation, "language": {key: [[INSTRUCTION_TEXT]] for key in observation["language"]}}
 
@@ -81,17 +88,22 @@ def expected_of(case: Case, folder: Path) -> Arrays:
     """The arrays of `given`, and as `expected (works, horizon, action_dim)` the normalised actions of
     `saccade_lab.reference` in float32. They are kept under `folder`.
     """
-    path = folder / f"expected-policy-{case.size}.npz"
+    path = folder / f"expected-policy-{case.release}-{case.size}.npz"
     if path.exists():
         with np.load(path) as held:
             return dict(held)
-    source = n15(folder, small=case.size == "small")
+    source = source_of(case, folder)
     arrays = inputs_of(source)
     arrays["expected"] = np.stack([reference_actions(source, given(arrays, views)) for views in VIEWS])
     part = path.with_suffix(".part.npz")
     np.savez(part, allow_pickle=False, **arrays)
     part.rename(path)
     return arrays
+
+
+def source_of(case: Case, folder: Path) -> Path:
+    """The checkpoint of a case, written under `folder` if it is not there."""
+    return random_policy(folder, case.release, small=case.size == "small")
 
 
 def inputs_of(source: Path) -> Arrays:
@@ -114,6 +126,8 @@ def inputs_of(source: Path) -> Arrays:
         (inputs,) = prepare_inputs([read(observation, seeing.requirements)], seeing.processor)
         assert inputs.attention_mask.all()
         arrays |= {f"pixels{views}": np.asarray(inputs.pixel_values), f"ids{views}": inputs.input_ids}
+        if inputs.image_grid_thw is not None:
+            arrays[f"grids{views}"] = inputs.image_grid_thw
         arrays["state"] = np.asarray(
             policy.normalizer.state(read_state(observation, seeing.requirements).state)
         )
@@ -128,10 +142,12 @@ def reference_actions(source: Path, one: Given) -> NDArray[np.float32]:
     from saccade_lab.reference import ActionHead, Backbone
 
     with torch.inference_mode():
-        inputs = saccade.BackboneInputs(one.pixels, one.ids)
-        features = Backbone.from_pretrained(source)(inputs).backbone_features
+        inputs = saccade.BackboneInputs(one.pixels, one.ids, image_grid_thw=one.grids)
+        seen = Backbone.from_pretrained(source)(inputs)
         head = ActionHead.from_pretrained(source)
+        context = head.encode(seen.backbone_features)
+        masks = {"image_mask": seen.image_mask} if head.config.mask_mode != "none" else {}
         actions = head.sample(
-            head.encode(features), one.state, one.embodiment_id, noise=one.noise, num_steps=4
+            context, one.state, one.embodiment_id, noise=one.noise, num_steps=STEPS, **masks
         )
     return np.asarray(actions[0].numpy())

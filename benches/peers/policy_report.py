@@ -1,4 +1,4 @@
-"""The report of the whole policy: Markdown of one machine, and docs/results/policy-speed.md of all."""
+"""The report of the whole policy: Markdown of one run, and docs/results/policy-speed.md of all machines."""
 
 from __future__ import annotations
 
@@ -7,7 +7,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from benches.pages.report import require_commit
-from benches.peers.cases import Case
+from benches.peers import results as kept
+from benches.peers.cases import RELEASES, Case
 from benches.peers.contenders import CONTENDERS
 from benches.peers.goals import Goal, reached
 from benches.peers.report import demoted, joined, said_of
@@ -17,6 +18,8 @@ from saccade_lab.timing import quartiles
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "results" / "policy-speed.md"
 NOTES = Path(__file__).with_name("policy_notes.md")
+RECORDS = kept.RECORDS / "policy"
+"""A folder for each release, with a JSON file per CPU family."""
 
 LEROBOT_BF16 = ("policy-lerobot-bfloat16-pure", "policy-lerobot-bfloat16")
 GOALS = tuple(
@@ -33,7 +36,7 @@ GOALS = tuple(
 def command(results: Results, args: argparse.Namespace) -> int:
     """`python -m benches.peers report --only policy`."""
     if args.write:
-        measured = records(args.record)
+        measured = recorded(args.record)
         for each in measured:
             require_commit(each.data, each.path)
         PAGE.write_text(page(measured))
@@ -51,22 +54,39 @@ def command(results: Results, args: argparse.Namespace) -> int:
 def write(results: Results, folder: Path) -> None:
     """Writes `policy-report.md` into the folder of the JSON file."""
     path = folder / "policy-report.md"
-    path.write_text(joined([f"# The whole policy, {results.cpu}", *of_machine(results), notes()]))
+    path.write_text(joined([f"# The whole policy, {title(results)}", *of_run(results), notes()]))
     print(path)
 
 
+def recorded(folder: Path = RECORDS) -> list[Results]:
+    """The committed measurements by name of the CPU, then by release."""
+    found = [results for release in RELEASES for results in records(folder / release)]
+    return sorted(found, key=lambda results: (results.cpu, release_of(results)))
+
+
+def release_of(results: Results) -> str:
+    """The release that was measured; each has files of its own."""
+    (release,) = {case.release for case in results.cases}
+    return release
+
+
+def title(results: Results) -> str:
+    """`Zen 4, N1.5`."""
+    return f"{results.cpu}, {release_of(results).upper()}"
+
+
 def page(measured: list[Results]) -> str:
-    """docs/results/policy-speed.md: all machines, one after the other."""
+    """docs/results/policy-speed.md: all machines and releases, one after the other."""
     parts = [
         "# Speed of the whole policy",
-        "From camera images and an instruction to a chunk of actions: N1.5 at its published size with "
-        "seeded random weights. "
+        "From camera images and an instruction to a chunk of actions: N1.5 and N1.7 at their published sizes "
+        "with seeded random weights. "
         '`make bench-peers PEERS_ARGS="--only policy"` measures a machine and keeps the numbers in '
-        "`benches/peers/results/policy/`, one file per CPU family; "
+        "`benches/peers/results/policy/`, one file per release and CPU family; "
         "`python -m benches.peers report --only policy --write` writes this page from these files.",
     ]
     for results in measured:
-        parts += [f"## {results.cpu}", *(demoted(part) for part in of_machine(results))]
+        parts += [f"## {title(results)}", *(demoted(part) for part in of_run(results))]
     return joined([*parts, notes()])
 
 
@@ -75,14 +95,14 @@ def notes() -> str:
     return NOTES.read_text().strip()
 
 
-def of_machine(results: Results) -> list[str]:
-    """What was measured on one machine."""
+def of_run(results: Results) -> list[str]:
+    """What was measured of one release on one machine."""
+    cases = usual(results, "policy", release_of(results))
     return [
         machine(results),
-        "## Targets",
-        goals(results),
+        *(["## Targets", goals(results)] if goals(results) else []),
         said_of(results),
-        *(part for case in usual(results, "policy") for part in section(results, case)),
+        *(part for case in cases for part in section(results, case)),
     ]
 
 
@@ -104,12 +124,12 @@ def machine(results: Results) -> str:
 
 
 def goals(results: Results) -> str:
-    """The table of targets, and whether each was reached."""
+    """The table of targets, and whether each was reached. They are those of N1.5."""
     rows = [
         row for case in usual(results, "policy") for goal in GOALS for row in goal_row(results, case, goal)
     ]
     head = ["", "against", "threads", "target (exceeded at)", "times as fast (quartiles)", "reached"]
-    return table(head, rows) if rows else "Nothing measured yet."
+    return table(head, rows) if rows else ""
 
 
 def goal_row(results: Results, case: Case, goal: Goal) -> Iterator[list[str]]:
@@ -157,6 +177,8 @@ def section(results: Results, case: Case) -> list[str]:
         if how in entry and name not in results.names(case)
     }
     said = [f"- {label} could not run: {reason}" for label, reason in failed.items()]
+    notes = {CONTENDERS[name].label: results.notes(case, name) for name in names}
+    said += [f"- {label}: {note}." for label, note in notes.items() if note]
     return [f"## {plural(case.threads).capitalize()}", table([*head, "error"], rows), "\n".join(said)]
 
 

@@ -23,7 +23,6 @@ from typing import Any
 
 import numpy as np
 
-from benches.checkpoints import n15
 from benches.peers import inputs, policy_inputs
 from benches.peers.cases import Case
 from benches.peers.contenders import CONTENDERS
@@ -88,7 +87,7 @@ def build(name: str, case: Case, work_folder: Path, shared: dict[str, Any]) -> t
     graphs.mkdir(parents=True, exist_ok=True)
     if case.piece == "policy":
         arrays = policy_inputs.expected_of(case, work_folder)
-        source = n15(work_folder, small=case.size == "small")
+        source = policy_inputs.source_of(case, work_folder)
     else:
         arrays = inputs.expected_of(case, work_folder)
         # Values are the same in both; who holds them in fewer bits has less to read.
@@ -135,7 +134,7 @@ def graphs_folder(case: Case, work_folder: Path) -> Path:
     """Folder of the graphs of a case, independent of its threads and steps."""
     parts = (case.size, case.piece, case.num_vl_tokens, case.num_future_tokens, case.batch, case.samples)
     if case.piece == "policy":
-        return work_folder / "graphs" / f"{case.size}-policy"
+        return work_folder / "graphs" / f"{case.size}-policy-{case.release}"
     return work_folder / "graphs" / "-".join(map(str, parts))
 
 

@@ -17,7 +17,7 @@ RECORDS = Path(__file__).with_name("results")
 """The committed measurements: a JSON file per CPU family, and what to say about it in a Markdown file of the
 same name.
 """
-TOLERANCE = {"float32": 1e-4, "bfloat16": 5e-2, "int8": 1e-1}
+TOLERANCE = {"float32": 1e-4, "bfloat16": 5e-2, "int8": 1e-1, "int4": 5e-1}
 """Tolerances relative to the reference's largest absolute value; larger differences are not ranked."""
 
 
@@ -111,6 +111,10 @@ class Results:
         """Largest absolute difference from the reference, and the reference's largest absolute value."""
         entry = [entry for entry in self.entries(case, name) if "error" in entry][-1]
         return entry["error"], entry["scale"]
+
+    def notes(self, case: Case, name: str) -> str:
+        """What the engine said of its settings."""
+        return str([entry for entry in self.entries(case, name) if "error" in entry][-1]["notes"])
 
     def is_correct(self, case: Case, name: str) -> bool:
         """Whether the contender's result is within the tolerance of its arithmetic."""

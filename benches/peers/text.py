@@ -26,9 +26,9 @@ WORK_TITLES = {
 PART_TITLES = {"held": "with cached keys and values", "both": "including keys and values"}
 
 
-def usual(results: Results, piece: str) -> list[Case]:
+def usual(results: Results, piece: str, release: str = "n1.5") -> list[Case]:
     """The measured cases of a piece at the released size, one view and one observation, by thread count."""
-    return sorted(case for case in results.cases if case == Case(piece, case.threads))
+    return sorted(case for case in results.cases if case == Case(piece, case.threads, release=release))
 
 
 def size(case: Case) -> str:

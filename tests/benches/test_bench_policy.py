@@ -6,29 +6,31 @@ import importlib
 import json
 import os
 import subprocess
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from benches.checkpoints import n15
 from benches.peers import __main__ as command
-from benches.peers import policy_inputs, policy_report
-from benches.peers.cases import Case
+from benches.peers import machine, policy_inputs, policy_report
+from benches.peers.cases import RELEASES, Case
 from benches.peers.contenders import CONTENDERS, POLICY_GROUPS, PROCESSES
 from benches.peers.engines import Task, vla_cpp
 from benches.peers.processes import difference, sharing
-from benches.peers.results import RECORDS, Results, records
+from benches.peers.results import Results
 from tests.benches.test_bench_peers_runs import run, small
 
 CASE = Case("policy", 2)
-SMALL = Case("policy", 1, size="small")
+SMALL = {release: Case("policy", 1, size="small", release=release) for release in RELEASES}
 PACKAGES = {
-    "lerobot_policy": ["lerobot"],
     "open_vino": ["onnxscript", "openvino"],
     "onnx_runtime": ["onnxscript", "onnxruntime"],
 }
+LEROBOT = {"n1.5": "0.4.4", "n1.7": "0.6.1"}
+TOLERANCES = {"float32": 1e-5, "int4": 0.4}
+"""By arithmetic, of others 0.04."""
 
 
 @pytest.fixture(scope="module")
@@ -36,38 +38,48 @@ def work(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tmp_path_factory.mktemp("policy")
 
 
+def task_of(release: str, work: Path, options: Mapping[str, Any]) -> Task:
+    case = SMALL[release]
+    graphs = work / f"graphs-{release}"
+    graphs.mkdir(exist_ok=True)
+    arrays = policy_inputs.expected_of(case, work)
+    return Task(case, dict(options), policy_inputs.source_of(case, work), arrays, graphs)
+
+
+@pytest.mark.parametrize("release", RELEASES)
 @pytest.mark.parametrize("name", [name for group in POLICY_GROUPS.values() for name in group])
-def test_every_engine_computes_what_the_reference_does(name: str, work: Path) -> None:
+def test_every_engine_computes_what_the_reference_does(name: str, release: str, work: Path) -> None:
     contender = CONTENDERS[name]
+    if contender.engine == "lerobot_policy" and machine.version("lerobot") != LEROBOT[release]:
+        pytest.skip(f"needs lerobot {LEROBOT[release]}")
+    if "compiled" in contender.options:
+        pytest.skip("takes minutes to compile")
     for package in PACKAGES.get(contender.options.get("opened_by", contender.engine), ()):
         pytest.importorskip(package, reason="in the environment of make bench-peers")
     if contender.engine == "vla_cpp":
         pytest.skip("vla.cpp has only the published size")
-    arrays = policy_inputs.expected_of(SMALL, work)
-    source = n15(work, small=True)
-    task = Task(SMALL, dict(contender.options), source, arrays, work)
+    task = task_of(release, work, contender.options)
     built = importlib.import_module(f"benches.peers.engines.{contender.engine}").build(task)
-    error, scale = difference(built.result(), arrays["expected"])
-    exact = name.endswith("float32")
-    assert 0.0 < error <= (1e-5 if exact else 0.04) * scale
-    assert tuple(built.works) == SMALL.works
+    error, scale = difference(built.result(), task.arrays["expected"])
+    assert 0.0 < error <= TOLERANCES.get(name.rpartition("-")[2], 0.04) * scale
+    assert tuple(built.works) == task.case.works
     for call in built.works.values():
         call()
 
 
 def test_what_is_not_built_says_how(work: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("SACCADE_PEERS_VLA", str(work / "nowhere"))
-    arrays = policy_inputs.expected_of(SMALL, work)
-    task = Task(SMALL, {}, n15(work, small=True), arrays, work)
+    task = task_of("n1.5", work, {"weights": "BF16"})
     with pytest.raises(FileNotFoundError, match="make bench-peers VLA_SOURCE"):
         vla_cpp.build(task)
 
 
-def test_one_view_and_two_are_different_questions(work: Path) -> None:
-    arrays = policy_inputs.expected_of(SMALL, work)
+@pytest.mark.parametrize("release", RELEASES)
+def test_one_view_and_two_are_different_questions(release: str, work: Path) -> None:
+    arrays = policy_inputs.expected_of(SMALL[release], work)
     one, two = (policy_inputs.given(arrays, views) for views in policy_inputs.VIEWS)
-    assert (len(one.pixels), len(two.pixels)) == (1, 2)
-    np.testing.assert_array_equal(one.pixels[0], two.pixels[0])
+    assert len(two.pixels) == 2 * len(one.pixels)
+    np.testing.assert_array_equal(one.pixels, two.pixels[: len(one.pixels)])
     assert one.ids.shape[1] < two.ids.shape[1]
     assert arrays["expected"].shape == (2, *one.noise.shape[1:])
     assert np.abs(arrays["expected"][0] - arrays["expected"][1]).max() > 1e-3
@@ -139,7 +151,7 @@ def test_the_report_of_known_numbers(tmp_path: Path) -> None:
     assert (
         "| saccade int8 | 750.0 (625.0 to 875.0) | 3.80 x | 1500 (1250 to 1750) | 3.80 x | 2.5e-02 |" in page
     )
-    assert "- lerobot 0.4.4 float32 could not run: MemoryError: no" in page
+    assert "- lerobot float32 could not run: MemoryError: no" in page
     assert "Peaks of 2 threads: float32 100, bfloat16 200, int8 400 GMAC/s, 20 GB/s." in page
 
 
@@ -156,16 +168,34 @@ def test_a_wrong_result_is_not_compared_with(tmp_path: Path) -> None:
 
 
 def test_the_page_contains_what_was_measured() -> None:
-    measured = records(RECORDS / "policy")
+    measured = policy_report.recorded()
+    assert measured
     for results in measured:
         assert results.path.name == f"{results.slug}.json"
-    assert not measured or policy_report.PAGE.read_text() == policy_report.page(measured)
+        assert results.path.parent.name == policy_report.release_of(results)
+    assert policy_report.PAGE.read_text() == policy_report.page(measured)
+
+
+def test_frames_of_patches() -> None:
+    """vla.cpp is given frames: what N1.7's patches were cut from, two by two, every value twice in time."""
+    side, rows, columns = 16, 4, 6
+    frames = np.random.default_rng(0).standard_normal((2, 3, rows * side, columns * side)).astype(np.float32)
+    patches = [
+        np.stack([frame[:, y : y + side, x : x + side]] * 2, axis=1).ravel()
+        for frame in frames
+        for top in range(0, rows * side, 2 * side)
+        for left in range(0, columns * side, 2 * side)
+        for y in (top, top + side)
+        for x in (left, left + side)
+    ]
+    grids = np.array([[1, rows, columns]] * 2)
+    np.testing.assert_array_equal(vla_cpp.unpatched(np.array(patches), grids), frames)
 
 
 def test_what_matters_most_is_measured_together_and_first(tmp_path: Path) -> None:
     args = command.parse(["--only", "policy"])
-    assert args.results == Path("out/peers/policy.json")
-    assert args.record == RECORDS / "policy"
+    assert args.results == Path("out/peers/policy-n1.5.json")
+    assert args.record == policy_report.RECORDS
     assert 2 in args.threads
     args.memory = 19.0
     found = command.batches(Results(tmp_path / "policy.json"), CASE, args, args.contenders)
@@ -227,10 +257,10 @@ def test_it_runs_and_goes_on_where_it_stopped(tmp_path: Path, known_peaks: None)
     chosen += ["--record", str(tmp_path / "record")]
     done = run(tmp_path, *chosen)
     assert done.returncode == 0, done.stderr
-    found = json.loads((tmp_path / "policy.json").read_text())["records"]
+    found = json.loads((tmp_path / "policy-n1.5.json").read_text())["records"]
     assert len(found) == 2
     assert command.main([*small(tmp_path), *chosen]) == 0
-    assert json.loads((tmp_path / "policy.json").read_text())["records"] == found
+    assert json.loads((tmp_path / "policy-n1.5.json").read_text())["records"] == found
     entries: dict[str, Any] = {name: one for record in found for name, one in record["contenders"].items()}
     assert set(entries) == set(names)
     for entry in entries.values():

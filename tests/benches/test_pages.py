@@ -43,7 +43,9 @@ def test_both_ways_to_name_a_changed_tree_are_known(version: dict[str, str]) -> 
 def test_peers_write_no_page_of_such_a_record(tmp_path: Path) -> None:
     data = json.loads((RECORDS / "zen-5.json").read_text())
     data["machine"]["commit"] += "-dirty"
-    (tmp_path / "zen-5.json").write_text(json.dumps(data))
+    (tmp_path / "n1.5").mkdir()
+    for folder in (tmp_path, tmp_path / "n1.5"):
+        (folder / "zen-5.json").write_text(json.dumps(data))
     for more in ([], ["--only", "policy"]):
         with pytest.raises(UncommittedError):
             peers.main(["report", "--write", "--record", str(tmp_path), *more])

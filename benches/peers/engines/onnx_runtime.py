@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import onnx
 import onnxruntime
 import torch
 from numpy.typing import NDArray
@@ -76,6 +77,10 @@ def export(module: nn.Module, inputs: tuple[Tensor, ...], path: Path, dynamic_sh
         verbose=False,
         dynamic_shapes=dynamic_shapes,
     )
+    model = onnx.load(part, load_external_data=False)
+    # Shapes between the layers are partly those of the examples, which the quantiser would believe.
+    del model.graph.value_info[:]
+    onnx.save(model, part)
     part.rename(path)
 
 

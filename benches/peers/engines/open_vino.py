@@ -1,4 +1,4 @@
-"""OpenVINO: the pieces converted from torch, for latency, in float32 or bfloat16."""
+"""OpenVINO: the pieces converted from torch, for latency, in float32, bfloat16 or with weights of int8."""
 
 from __future__ import annotations
 
@@ -16,13 +16,17 @@ from benches.peers.engines import Built, Task, graphs
 
 
 class OpenVino:
-    """Options: `arithmetic` is `float32` or `bfloat16` (OpenVINO's inference precision)."""
+    """Options: `arithmetic` is `float32` or `bfloat16`, OpenVINO's inference precision, or `int8`: bfloat16
+    with weights that NNCF compressed to int8, one scale per output channel. OpenVINO then rounds inputs of
+    these layers to int8 in groups while it computes, its default where the CPU has int8 products.
+    """
 
     def __init__(self, task: Task) -> None:
         self.folder = task.graphs
         self.core = openvino.Core()
+        self.arithmetic = task.options["arithmetic"]
         self.properties = {
-            "INFERENCE_PRECISION_HINT": {"float32": "f32", "bfloat16": "bf16"}[task.options["arithmetic"]],
+            "INFERENCE_PRECISION_HINT": "f32" if self.arithmetic == "float32" else "bf16",
             "PERFORMANCE_HINT": "LATENCY",
             "INFERENCE_NUM_THREADS": task.case.threads,
             "NUM_STREAMS": 1,
@@ -34,14 +38,18 @@ class OpenVino:
         if not path.exists():
             shapes = [list(tensor.shape) for tensor in inputs]
             model = openvino.convert_model(module().eval(), example_input=inputs, input=shapes)
-            part = path.with_name(f"part-{path.name}")
-            openvino.save_model(model, part, compress_to_fp16=False)
-            part.with_suffix(".bin").rename(path.with_suffix(".bin"))
-            part.rename(path)
+            save(model, path)
         return self.opened(path)
 
     def opened(self, path: Path) -> graphs.Graph:
-        """A model in a file, compiled for the CPU."""
+        """A model in a file, compiled for the CPU; its weights are compressed first if the arithmetic is
+        `int8`.
+        """
+        if self.arithmetic == "int8":
+            narrow = path.with_name(f"{path.stem}-int8.xml")
+            if not narrow.exists():
+                compress(self.core, path, narrow)
+            path = narrow
         request = self.core.compile_model(path, "CPU", self.properties).create_infer_request()
 
         def call(*arrays: NDArray[np.float32]) -> tuple[Any, ...]:
@@ -58,6 +66,22 @@ class OpenVino:
     def numpy(self, array: NDArray[np.float32]) -> NDArray[np.float32]:
         """The output unchanged."""
         return array
+
+
+def compress(core: openvino.Core, path: Path, narrow: Path) -> None:
+    """Weights of matrix products to int8, by NNCF."""
+    import nncf
+
+    model = nncf.compress_weights(core.read_model(path), mode=nncf.CompressWeightsMode.INT8_SYM)
+    save(model, narrow)
+
+
+def save(model: openvino.Model, path: Path) -> None:
+    """Writes a model, under a temporary name first."""
+    part = path.with_name(f"part-{path.name}")
+    openvino.save_model(model, part, compress_to_fp16=False)
+    part.with_suffix(".bin").rename(path.with_suffix(".bin"))
+    part.rename(path)
 
 
 def build(task: Task) -> Built:

@@ -1,4 +1,4 @@
-"""vla.cpp's N1.5, through the C interface of its library, `include/vla.h`."""
+"""vla.cpp's N1.5 and N1.7, through the C interface of its library, `include/vla.h`."""
 
 from __future__ import annotations
 
@@ -20,6 +20,7 @@ from benches.peers.engines import Built, Task
 from benches.peers.policy_inputs import VIEWS, Given, given
 
 FLOAT32_RGB = 1
+CONVERTERS = {"n1.5": "convert_gr00t_n1_5_to_gguf.py", "n1.7": "convert_gr00t_n1_7_to_gguf.py"}
 
 
 class Image(ctypes.Structure):
@@ -47,14 +48,17 @@ class Inputs(ctypes.Structure):
 
 
 def build(task: Task) -> Built:
-    """Weights in bfloat16, its default. Only the published size."""
+    """Options: `weights` is `BF16`, its default, or a type that its script packs to.
+
+    Only the published size.
+    """
     folder = Path(os.environ.get("SACCADE_PEERS_VLA") or "vla")
     if not (folder / "libvla.so").exists():
         raise FileNotFoundError(
             f"{folder}/libvla.so is not there; make bench-peers VLA_SOURCE=CLONE builds it from "
             "github.com/VinRobotics/vla.cpp"
         )
-    weights = converted(task.source, task.graphs / "vla.gguf", folder)
+    weights = packed(task, folder)
     one = given(task.arrays, VIEWS[0])
     # It reads both when it loads.
     os.environ["VLA_GR00T_EMBODIMENT"] = str(one.embodiment_id)
@@ -68,28 +72,35 @@ def build(task: Task) -> Built:
         work: partial(chunk, library, model, arguments(given(task.arrays, views)), shape)
         for work, views in zip(task.case.works, VIEWS, strict=True)
     }
-    return Built(works, lambda: np.stack([work() for work in works.values()]), is_warm=True)
+    version = (folder / "version.txt").read_text().strip()
+    return Built(works, lambda: np.stack([work() for work in works.values()]), notes=version, is_warm=True)
 
 
-def converted(source: Path, path: Path, folder: Path) -> Path:
-    """The checkpoint in its format, written by its own script if it is not there: 4.8 GB."""
-    with path.with_suffix(".lock").open("w") as lock:
+def packed(task: Task, folder: Path) -> Path:
+    """The checkpoint in its format, 5 to 6 GB, or packed, written by its own scripts if it is not there."""
+    weights = task.options["weights"]
+    with (task.graphs / "vla.lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
-        if not path.exists():
-            part = path.with_name(f"part-{path.name}")
-            script = folder / "scripts" / "convert_gr00t_n1_5_to_gguf.py"
-            command = [
-                sys.executable,
-                str(script),
-                "--ckpt",
-                str(source.absolute()),
-                "--out",
-                str(part.absolute()),
-            ]
-            environment = {**os.environ, "PYTHONPATH": str(folder / "gguf-py")}
-            subprocess.run(command, check=True, env=environment, stdout=subprocess.DEVNULL)
-            part.rename(path)
-    return path.absolute()
+        whole = task.graphs / "vla-BF16.gguf"
+        script = folder / "scripts" / CONVERTERS[task.case.release]
+        written(whole, folder, script, "--ckpt", task.source.absolute())
+        if weights == "BF16":
+            return whole.absolute()
+        narrow = task.graphs / f"vla-{weights}.gguf"
+        script = folder / "scripts" / "quantize_gguf.py"
+        written(narrow, folder, script, "--type", weights, "--vision", "--in", whole.absolute())
+        return narrow.absolute()
+
+
+def written(path: Path, folder: Path, script: Path, *options: str | Path) -> None:
+    """Runs a script that writes to `--out`, unless the file is there."""
+    if path.exists():
+        return
+    part = path.with_name(f"part-{path.name}").absolute()
+    environment = {**os.environ, "PYTHONPATH": str(folder / "gguf-py")}
+    command = [sys.executable, *map(str, (script, *options, "--out", part))]
+    subprocess.run(command, check=True, env=environment, stdout=subprocess.DEVNULL)
+    part.rename(path)
 
 
 def opened(path: Path) -> Any:
@@ -104,7 +115,8 @@ def opened(path: Path) -> Any:
 def arguments(one: Given) -> tuple[Inputs, list[Any]]:
     """The inputs of a call, and what must live as long."""
     # Pixels from 0 to 1, rows of RGB; the library maps them back to -1 to 1.
-    frames = [np.ascontiguousarray((view.transpose(1, 2, 0) + 1) / 2, np.float32) for view in one.pixels]
+    views = one.pixels if one.grids is None else unpatched(one.pixels, one.grids)
+    frames = [np.ascontiguousarray((view.transpose(1, 2, 0) + 1) / 2, np.float32) for view in views]
     images = (Image * len(frames))(
         *(Image(frame.ctypes.data, frame.shape[1], frame.shape[0], FLOAT32_RGB) for frame in frames)
     )
@@ -119,6 +131,17 @@ def arguments(one: Given) -> tuple[Inputs, list[Any]]:
         noise=noise.ctypes.data_as(POINTER(c_float)),
     )
     return held, [frames, images, tokens, state, noise]
+
+
+def unpatched(patches: NDArray[np.float32], grids: NDArray[np.int64]) -> NDArray[np.float32]:
+    """The views `(V, 3, side, side)` that N1.7's patches, of which 2 x 2 follow each other, were cut from."""
+    ((_, rows, columns),) = np.unique(grids, axis=0)
+    side = round((patches.shape[1] / 6) ** 0.5)  # a patch has three colours, twice
+    cut = patches.reshape(-1, rows // 2, columns // 2, 2, 2, 3, 2, side, side)[:, :, :, :, :, :, 0]
+    views: NDArray[np.float32] = cut.transpose(0, 5, 1, 3, 6, 2, 4, 7).reshape(
+        -1, 3, rows * side, columns * side
+    )
+    return views
 
 
 def chunk(

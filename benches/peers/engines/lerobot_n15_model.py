@@ -1,4 +1,4 @@
-"""The N1.5 model of lerobot 0.4.4 with the weights of a checkpoint, without the rest of lerobot.
+"""lerobot's N1.5 model, of lerobot 0.4.4, with the weights of a checkpoint, without the rest of lerobot.
 
 lerobot asks the Hub for the sizes of its backbone, and needs FlashAttention, which only runs on a GPU. Here
 the sizes are those of the checkpoint, and the attention is torch's SDPA. All else is lerobot's code.
@@ -23,7 +23,6 @@ from typing import Any
 from unittest import mock
 
 import torch
-from safetensors import safe_open
 from torch import Tensor
 from transformers.modeling_utils import no_init_weights
 
@@ -34,18 +33,7 @@ from saccade_lab.reference import lerobot_backbone, lerobot_head
 GROOT = "lerobot.policies.groot"
 
 
-def tensors_of(source: Path, dtype: torch.dtype) -> dict[str, Tensor]:
-    """All tensors of a checkpoint in `dtype`, by their names."""
-    tensors = {}
-    for path in sorted(source.glob("*.safetensors")):
-        with safe_open(path, framework="pt") as file:
-            for name in file.keys():  # noqa: SIM118 (the handle of safetensors is not a dict)
-                # Copied, because a mapped file has no huge pages.
-                tensors[name] = file.get_tensor(name).to(dtype, copy=True)
-    return tensors
-
-
-def build(source: Path, tensors: dict[str, Tensor], compute_dtype: torch.dtype) -> Any:
+def build(source: Path, tensors: dict[str, Tensor], *, compute_dtype: torch.dtype) -> Any:
     """A `GR00TN15` in evaluation mode.
 
     Args:
