@@ -186,8 +186,10 @@ def bench_peers(session: nox.Session) -> None:
     `--release` names one. The latter needs Python 3.12: `python3.12` on PATH, or SACCADE_PYTHON312.
     """
     needs(session, "python", "rust")
-    for release in peers.releases(session.posargs):
-        environment, variables = peers.environment_of(session, release)
+    releases = peers.releases(session.posargs)
+    # What one of them lacks is said before the other is measured.
+    environments = [peers.environment_of(session, release) for release in releases]
+    for release, (environment, variables) in zip(releases, environments, strict=True):
         environment.run("-m", "benches.peers", *session.posargs, "--release", release, **variables)
 
 

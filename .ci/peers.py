@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import os
 import shutil
 from collections.abc import Sequence
@@ -15,9 +16,13 @@ LIBRARIES = ENVIRONMENTS / "ggml"
 
 def releases(options: Sequence[str]) -> list[str]:
     """The releases that a run measures: that of `--release`, or both of the whole policy."""
-    if "--release" in options:
-        return list(options[options.index("--release") + 1 :][:1])
-    return ["n1.5", "n1.7"] if "policy" in options else ["n1.5"]
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    parser.add_argument("--release")
+    parser.add_argument("--only", nargs="+", default=[])
+    found, _ = parser.parse_known_args(options)
+    if found.release is not None:
+        return [found.release]
+    return ["n1.5", "n1.7"] if found.only == ["policy"] else ["n1.5"]
 
 
 def environment_of(session: nox.Session, release: str) -> tuple[Environment, dict[str, str]]:
@@ -36,7 +41,9 @@ def environment_of(session: nox.Session, release: str) -> tuple[Environment, dic
     # It is optional: without it, the report has no rows of ggml and says so.
     build(environment, "ggml", ggml, optional=True)
     if source := os.environ.get("VLA_SOURCE", ""):
-        build(environment, "vla", f"{ggml} {digest([SCRIPTS / 'build_vla.sh'])} {source}", source)
+        command = ("git", "-C", source, "describe", "--always", "--dirty", "--exclude", "*")
+        commit = str(session.run(*command, external=True, silent=True, log=False)).strip()
+        build(environment, "vla", f"{ggml} {digest([SCRIPTS / 'build_vla.sh'])} {commit}", source)
     return environment, {
         "SACCADE_PEERS_GGML": str(LIBRARIES / "ggml/build/bin"),
         "SACCADE_PEERS_VLA": str(LIBRARIES / "vla"),

@@ -28,7 +28,7 @@ def random_policy(work: Path, version: str, *, small: bool) -> Path:
 
     Args:
         work: Folder that keeps it as `n15`, `n17` or the like, 5 to 6 GB, small ones as `n15-small`.
-        version: `"n1.5"`, `"n1.6"` or `"n1.7"`.
+        version: `"n1.5"` or `"n1.7"`.
         small: Small sizes, for a quick trial.
     """
     name = version.replace(".", "")

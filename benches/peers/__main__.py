@@ -261,8 +261,8 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
     parser.add_argument(
         "--record",
         type=Path,
-        help="folder with a JSON file per CPU family (default benches/peers/results), of policy one with "
-        "such a folder for each release (default: policy in it)",
+        help="folder with a JSON file per CPU family (default benches/peers/results); of policy a folder "
+        "RELEASE in it (default benches/peers/results/policy)",
     )
     parser.add_argument("--write", action="store_true", help="report: write the page in docs from --record")
     args = parser.parse_args(arguments)

@@ -21,5 +21,5 @@ for source in model loader options vla_c_api modules/* models/*; do
 done
 c++ -shared -o libvla.so objects/*.o -L "$libraries" -lggml -lggml-base -lggml-cpu "-Wl,-rpath,$libraries"
 cp -r "$clone/scripts" scripts
-echo "commit $(git -C "$clone" rev-parse --short HEAD), $(basename "$folder"/ggml/llama_cpp_python-*.tar.gz .tar.gz)" >version.txt
+echo "commit $(git -C "$clone" describe --always --dirty --exclude "*"), $(basename "$folder"/ggml/llama_cpp_python-*.tar.gz .tar.gz)" >version.txt
 cp -r "$llama/gguf-py" gguf-py

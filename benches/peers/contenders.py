@@ -177,7 +177,9 @@ POLICY_GROUPS: Mapping[str, Mapping[str, Contender]] = {
             "bfloat16, accelerate(policy, backbone=True)", "bfloat16", 4.8, accelerated="bfloat16"
         ),
         "policy-lerobot-bfloat16": _lerobot("bfloat16 weights, autocast", "bfloat16", autocast=True),
-        "policy-compile-bfloat16": _lerobot("bfloat16, torch.compile", "bfloat16", 1.0, compiled=True),
+        "policy-compile-bfloat16": _policy(
+            "lerobot bfloat16, torch.compile", "lerobot_policy", 10.0, arithmetic="bfloat16", compiled=True
+        ),
         "policy-saccade-int4": _saccade_policy("int4", 1.6),
     },
     "float32": {

@@ -22,6 +22,20 @@ RECORDS = kept.RECORDS / "policy"
 """A folder for each release, with a JSON file per CPU family."""
 
 LEROBOT_BF16 = ("policy-lerobot-bfloat16-pure", "policy-lerobot-bfloat16")
+OVERVIEW = (
+    "policy-lerobot-default",
+    "policy-lerobot-bfloat16-pure",
+    "policy-compile-bfloat16",
+    "policy-vla-bfloat16",
+    "policy-openvino-bfloat16",
+    "policy-openvino-int8",
+    "policy-onnxruntime-int8",
+    "policy-saccade-float32",
+    "policy-saccade-bfloat16",
+    "policy-saccade-int8",
+    "policy-saccade-int4",
+)
+"""The rows of README's table."""
 GOALS = tuple(
     Goal(f"{what}, {work}", "policy", work, LEROBOT_BF16, ours, least, beyond)
     for what, ours, least, beyond in (
@@ -52,8 +66,8 @@ def command(results: Results, args: argparse.Namespace) -> int:
 
 
 def write(results: Results, folder: Path) -> None:
-    """Writes `policy-report.md` into the folder of the JSON file."""
-    path = folder / "policy-report.md"
+    """Writes `policy-report-RELEASE.md` into the folder of the JSON file."""
+    path = folder / f"policy-report-{release_of(results)}.md"
     path.write_text(joined([f"# The whole policy, {title(results)}", *of_run(results), notes()]))
     print(path)
 
@@ -88,6 +102,24 @@ def page(measured: list[Results]) -> str:
     for results in measured:
         parts += [f"## {title(results)}", *(demoted(part) for part in of_run(results))]
     return joined([*parts, notes()])
+
+
+def overview(measured: list[Results]) -> str:
+    """The table of README: medians on two threads, one group of columns for each release."""
+    head = ["ms"]
+    rows = [[CONTENDERS[name].label] for name in OVERVIEW]
+    for results in measured:
+        release = release_of(results)
+        case = Case("policy", 2, release=release)
+        head += [*(f"{release.upper()}, {work}" for work in case.works), "error"]
+        for name, row in zip(OVERVIEW, rows, strict=True):
+            if name not in results.names(case):
+                row += [""] * (len(case.works) + 1)
+                continue
+            error, scale = results.error(case, name)
+            row += [number(quartiles(results.seconds(case, name, work))[1]) for work in case.works]
+            row.append(f"{error / scale:.1e}")
+    return table(head, rows)
 
 
 def notes() -> str:
@@ -168,7 +200,7 @@ def section(results: Results, case: Case) -> list[str]:
         rows.append(cells)
     head = ["ms"]
     for work in case.works:
-        head += [f"{work}: median (quartiles)", "against lerobot"]
+        head += [f"{work}: median (quartiles)", "against lerobot, eager"]
     failed = {
         CONTENDERS[name].label: entry[how]
         for record in results.records(case)

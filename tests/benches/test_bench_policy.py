@@ -20,7 +20,7 @@ from benches.peers.contenders import CONTENDERS, POLICY_GROUPS, PROCESSES
 from benches.peers.engines import Task, vla_cpp
 from benches.peers.processes import difference, sharing
 from benches.peers.results import Results
-from tests.benches.test_bench_peers_runs import run, small
+from tests.benches.test_bench_peers_runs import ROOT, run, small
 
 CASE = Case("policy", 2)
 SMALL = {release: Case("policy", 1, size="small", release=release) for release in RELEASES}
@@ -147,7 +147,7 @@ def test_the_report_of_known_numbers(tmp_path: Path) -> None:
         ),
     ]
     policy_report.write(results, tmp_path)
-    page = (tmp_path / "policy-report.md").read_text()
+    page = (tmp_path / "policy-report-n1.5.md").read_text()
     assert (
         "| saccade int8 | 750.0 (625.0 to 875.0) | 3.80 x | 1500 (1250 to 1750) | 3.80 x | 2.5e-02 |" in page
     )
@@ -174,6 +174,12 @@ def test_the_page_contains_what_was_measured() -> None:
         assert results.path.name == f"{results.slug}.json"
         assert results.path.parent.name == policy_report.release_of(results)
     assert policy_report.PAGE.read_text() == policy_report.page(measured)
+
+
+def test_readme_has_the_table_of_the_records() -> None:
+    measured = [results for results in policy_report.recorded() if results.cpu == "Zen 4"]
+    assert [policy_report.release_of(results) for results in measured] == list(RELEASES)
+    assert policy_report.overview(measured) in (ROOT / "README.md").read_text()
 
 
 def test_frames_of_patches() -> None:
@@ -268,5 +274,5 @@ def test_it_runs_and_goes_on_where_it_stopped(tmp_path: Path, known_peaks: None)
             "1 view": 1,
             "2 views": 1,
         }
-    assert (tmp_path / "policy-report.md").exists()
+    assert (tmp_path / "policy-report-n1.5.md").exists()
     assert not (tmp_path / "record").exists()  # small sizes are not kept

@@ -33,7 +33,7 @@ from saccade_lab.reference import lerobot_backbone, lerobot_head
 GROOT = "lerobot.policies.groot"
 
 
-def build(source: Path, tensors: dict[str, Tensor], *, compute_dtype: torch.dtype) -> Any:
+def build(source: Path, tensors: dict[str, Tensor], compute_dtype: torch.dtype) -> Any:
     """A `GR00TN15` in evaluation mode.
 
     Args:

@@ -21,20 +21,20 @@ from benches.backbone.setup import sizes_of
 from benches.peers.policy_inputs import Given
 
 
-def build(source: Path, tensors: dict[str, Tensor], *, compute_dtype: torch.dtype) -> Any:
+def build(source: Path, tensors: dict[str, Tensor], _: torch.dtype) -> Any:
     """A `GR00TN17` in evaluation mode.
 
     Args:
         source: a checkpoint of N1.7.
         tensors: its weights, which become those of the model without a copy.
-        compute_dtype: not read: it casts its inputs to the dtype of its weights.
+        _: N1.7 casts its inputs to the dtype of its weights, not to another one.
     """
     from lerobot.policies.groot import groot_n1_7 as groot
     from transformers.initialization import no_init_weights
 
     config = json.loads((source / "config.json").read_text())
     sizes = groot._cosmos_reason2_qwen3_vl_config()
-    own = config["backbone_cfg"].get("eagle_config")
+    own = config.get("backbone_cfg", {}).get("eagle_config")
     if own is not None:
         own = {key: own[key] for key in ("text_config", "vision_config")}
         sizes = groot.Qwen3VLConfig(**own, image_token_id=sizes_of(source).image_token)

@@ -14,6 +14,7 @@ import torch
 from numpy.typing import NDArray
 from safetensors import safe_open
 from torch import Tensor
+from torch._inductor import config as inductor
 
 from benches.peers.engines import Built, Task
 from benches.peers.policy_inputs import VIEWS, Given, given
@@ -23,8 +24,8 @@ MODELS = {"n1.5": "lerobot_n15_model", "n1.7": "lerobot_n17_model"}
 
 def build(task: Task) -> Built:
     """Options: `arithmetic` is the dtype of the weights; `autocast`: under autocast to bfloat16, lerobot's
-    default; `compiled`: by `torch.compile`; `accelerated`: by `saccade.integrations.accelerate`, with this
-    precision.
+    default; `compiled`: by `torch.compile`, whose settings hold for the process; `accelerated`: by
+    `saccade.integrations.accelerate`, with this precision.
 
     Contenders of one process share the weights.
     """
@@ -35,16 +36,17 @@ def build(task: Task) -> Built:
     autocast = bool(task.options.get("autocast"))
     # Each imports its release of lerobot, of which an environment has one.
     released: Any = importlib.import_module(f"benches.peers.engines.{MODELS[task.case.release]}")
-    computing = torch.bfloat16 if autocast else dtype
-    model = released.build(task.source, task.shared["tensors"], compute_dtype=computing)
+    model = released.build(task.source, task.shared["tensors"], torch.bfloat16 if autocast else dtype)
     if "accelerated" in task.options:
         from saccade.integrations import accelerate
 
         precision = task.options["accelerated"]
         accelerate(model, backbone=True, precision=precision, num_threads=task.case.threads)
     if "compiled" in task.options:
+        # Weights become constants, packed for the products; each number of views is compiled apart.
+        inductor.freezing = True
         for module in (model.backbone, model.action_head.vl_self_attention, model.action_head.model):
-            module.compile()
+            module.compile(dynamic=False)
     inputs = {views: released.inputs_of(given(task.arrays, views)) for views in VIEWS}
 
     def chunk(views: int) -> Any:

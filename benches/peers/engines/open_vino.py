@@ -17,8 +17,7 @@ from benches.peers.engines import Built, Task, graphs
 
 class OpenVino:
     """Options: `arithmetic` is `float32` or `bfloat16`, OpenVINO's inference precision, or `int8`: bfloat16
-    with weights that NNCF compressed to int8, one scale per output channel. OpenVINO then rounds inputs of
-    these layers to int8 in groups while it computes, its default where the CPU has int8 products.
+    with weights that NNCF compressed to int8, one scale per output channel. All else is OpenVINO's default.
     """
 
     def __init__(self, task: Task) -> None:
