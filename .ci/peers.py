@@ -12,6 +12,8 @@ from environments import ENVIRONMENTS, PROGRAMS, ROOT, Environment, digest
 
 SCRIPTS = ROOT / "benches" / "peers"
 LIBRARIES = ENVIRONMENTS / "ggml"
+#: What a build leaves in its folder.
+MADE = {"ggml": "build/bin/libggml.so", "vla": "libvla.so"}
 
 
 def releases(options: Sequence[str]) -> list[str]:
@@ -53,9 +55,9 @@ def environment_of(session: nox.Session, release: str) -> tuple[Environment, dic
 def build(
     environment: Environment, name: str, made_from: str, *arguments: str, optional: bool = False
 ) -> None:
-    """Runs benches/peers/build_NAME.sh, unless what it is made from is the same as before."""
-    stamp = LIBRARIES / f"{name}.txt"
-    if stamp.exists() and stamp.read_text() == made_from:
+    """Runs benches/peers/build_NAME.sh, unless the library is there and made from the same as before."""
+    stamp, library = LIBRARIES / f"{name}.txt", LIBRARIES / name / MADE[name]
+    if library.exists() and stamp.exists() and stamp.read_text() == made_from:
         return
     print(f"setup: {name} (takes minutes)", flush=True)
     path = os.pathsep.join((str(environment.folder / PROGRAMS), os.environ["PATH"]))
