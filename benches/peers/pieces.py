@@ -160,11 +160,15 @@ class Encode(nn.Module):
 
     def forward(self, features: Tensor) -> tuple[Tensor, ...]:
         """`(B, T_vl, C)` to the result of `Project`."""
-        x = self.norm(features)
+        held: tuple[Tensor, ...] = self.project(self.context(features))
+        return held
+
+    def context(self, features: Tensor) -> Tensor:
+        """What the cross blocks attend to, of the same shape."""
+        x: Tensor = self.norm(features)
         for block in self.blocks:
             x = block(x)
-        held: tuple[Tensor, ...] = self.project(x)
-        return held
+        return x
 
 
 class VlBlock(nn.Module):

@@ -50,8 +50,8 @@ class Language(nn.Module):
         return (self.norm(x),)
 
 
-def write_backbone(source: Path, folder: Path, arrays: Arrays) -> NDArray[np.int16]:
-    """Exports tower and language model; returns the bits of the table of tokens in bfloat16."""
+def write_backbone(source: Path, folder: Path, arrays: Arrays) -> Tensor:
+    """Exports tower and language model; returns the table of tokens."""
     from benches.peers.engines.onnx_runtime import export
 
     eagle: Any = Backbone.from_pretrained(source).requires_grad_(False).eagle_model
@@ -62,8 +62,8 @@ def write_backbone(source: Path, folder: Path, arrays: Arrays) -> NDArray[np.int
     export(Tower(eagle), (pixels,), folder / "tower.onnx", ({0: torch.export.Dim("views", max=64)},))
     embedded = decoder.embed_tokens(torch.from_numpy(two.ids))
     export(Language(decoder, eagle.sizes), (embedded,), folder / "language.onnx", ({1: tokens},))
-    bits: NDArray[np.int16] = decoder.embed_tokens.weight.bfloat16().view(torch.int16).numpy()
-    return bits
+    table: Tensor = decoder.embed_tokens.weight
+    return table
 
 
 def write_encode(head: ActionHead, folder: Path, arrays: Arrays) -> list[dict[int, Any]]:
@@ -77,10 +77,11 @@ def write_encode(head: ActionHead, folder: Path, arrays: Arrays) -> list[dict[in
     return [{2: tokens} for _ in range(2 * len(module.project.to_kv))]
 
 
-def features_of(run: Graphs, one: Given, table: Tensor, sizes: BackboneSizes) -> NDArray[np.float32]:
-    """Tower and language model: `(1, T, width)`."""
+def features_of(
+    run: Graphs, one: Given, embedded: NDArray[np.float32], sizes: BackboneSizes
+) -> NDArray[np.float32]:
+    """Tower and language model, whose embedded tokens are written into: `(1, T, width)`."""
     (tokens,) = run["tower"](one.pixels)
-    embedded = table[torch.from_numpy(one.ids)].float().numpy()
     embedded[one.ids == sizes.image_token] = tokens
     (features,) = run["language"](embedded)
     return features

@@ -78,30 +78,20 @@ class Encode(nn.Module):
 
     def __init__(self, head: ActionHead) -> None:
         super().__init__()
+        self.all = pieces.Encode(head)
         modules: Any = head
-        self.norm = modules.vlln
-        self.blocks = nn.ModuleList(
-            pieces.VlBlock(each) for each in modules.vl_self_attention.transformer_blocks
-        )
-        cross = [
-            (index, block.attn1)
-            for index, block in enumerate(modules.model.transformer_blocks)
-            if block.is_cross
-        ]
-        self.sees_images = [reads_images(head.config, index) for index, _ in cross]
-        self.project = pieces.Project([attention for _, attention in cross])
+        blocks = enumerate(modules.model.transformer_blocks)
+        self.sees_images = [reads_images(head.config, index) for index, block in blocks if block.is_cross]
 
     def forward(self, features: Tensor, image: Tensor, text: Tensor) -> tuple[Tensor, ...]:
         """`(1, T, C)`, and where the image and the text tokens are."""
-        x = self.norm(features)
-        for block in self.blocks:
-            x = block(x)
+        x = self.all.context(features)
         seen = {True: x.index_select(1, image), False: x.index_select(1, text)}
-        return self.project.of([seen[sees_images] for sees_images in self.sees_images])
+        return self.all.project.of([seen[sees_images] for sees_images in self.sees_images])
 
 
-def write_backbone(source: Path, folder: Path, arrays: Arrays) -> NDArray[np.int16]:
-    """Exports tower and language model; returns the bits of the table of tokens in bfloat16."""
+def write_backbone(source: Path, folder: Path, arrays: Arrays) -> Tensor:
+    """Exports tower and language model; returns the table of tokens."""
     from benches.peers.engines.onnx_runtime import export
 
     backbone: Any = Backbone.from_pretrained(source).requires_grad_(False)
@@ -120,8 +110,8 @@ def write_backbone(source: Path, folder: Path, arrays: Arrays) -> NDArray[np.int
     angles = torch.from_numpy(angles_of(two, backbone.sizes))
     shapes = ({1: tokens}, {0: tokens}, tuple({1: tokens} for _ in added))
     export(Language(decoder, backbone.sizes), (embedded, angles, *added), folder / "language.onnx", shapes)
-    bits: NDArray[np.int16] = decoder.embed_tokens.weight.bfloat16().view(torch.int16).numpy()
-    return bits
+    table: Tensor = decoder.embed_tokens.weight
+    return table
 
 
 def write_encode(head: ActionHead, folder: Path, arrays: Arrays) -> list[dict[int, Any]]:
@@ -140,11 +130,12 @@ def write_encode(head: ActionHead, folder: Path, arrays: Arrays) -> list[dict[in
     return [{2: axes[kind]} for kind in kinds for _ in range(2)]
 
 
-def features_of(run: Graphs, one: Given, table: Tensor, sizes: BackboneSizes) -> NDArray[np.float32]:
-    """Tower and language model: `(1, T, width)`."""
+def features_of(
+    run: Graphs, one: Given, embedded: NDArray[np.float32], sizes: BackboneSizes
+) -> NDArray[np.float32]:
+    """Tower and language model, whose embedded tokens are written into: `(1, T, width)`."""
     tokens, *stacked = run["tower"](by_view(one))
     is_image = one.ids == sizes.image_token
-    embedded = table[torch.from_numpy(one.ids)].float().numpy()
     embedded[is_image] = tokens
     added = []
     for layer in stacked:

@@ -41,7 +41,8 @@ def build(task: Task) -> Built:
 
     def chunk_of(views: int) -> NDArray[np.float32]:
         one = given(task.arrays, views)
-        features = release.features_of(run, one, table, sizes)
+        embedded = table[torch.from_numpy(one.ids)].float().numpy()
+        features = release.features_of(run, one, embedded, sizes)
         held = release.context_of(run, one, features, sizes)
         (row,) = run["state"](one.state.reshape(1, 1, -1))
         actions = one.noise
@@ -76,7 +77,8 @@ def write(task: Task, release: Any) -> None:
         if rest.exists():
             return
         with torch.no_grad():
-            table = release.write_backbone(task.source, task.graphs, task.arrays)
+            embeddings: torch.Tensor = release.write_backbone(task.source, task.graphs, task.arrays)
+            table = embeddings.bfloat16().view(torch.int16).numpy()  # NumPy has no bfloat16
             times = write_head(task.source, task.graphs, task.arrays, release)
         part = rest.with_suffix(".part.npz")
         np.savez(part, allow_pickle=False, table=table, **times)
