@@ -10,7 +10,6 @@ stopped goes on where it stopped.
 from __future__ import annotations
 
 import argparse
-import functools
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -28,6 +27,7 @@ from saccade_lab.sim.rollout import environment_for, run_episode
 from saccade_lab.study.cell import Cell, Rows
 from saccade_lab.study.run import run_cells
 from saccade_lab.study.section import points, rate
+from saccade_lab.study.simulator import policy_of
 from saccade_lab.study.statistics import paired_difference, wilson
 
 SEEDS = range(600, 612)
@@ -50,12 +50,6 @@ class Frozen(Policy):
         return super().act({**seen, "proprio": self._first}, **options)
 
 
-@functools.lru_cache(maxsize=1)
-def policy_in(folder: str) -> Policy:
-    """The policy in a folder. The last one is kept."""
-    return Policy.from_pretrained(folder, num_threads=1)
-
-
 @dataclass(frozen=True)
 class Run:
     """Runs the episodes of a task for one policy without one input."""
@@ -65,7 +59,7 @@ class Run:
     def __call__(self, cell: Cell) -> Rows:
         """A row for each seed."""
         label, arm, task = map(str, cell.key)
-        policy = policy_in(self.folders[label])
+        policy = policy_of(self.folders[label])
         blanked = (arm.removeprefix("camera."),) if arm.startswith("camera.") else ()
         environment = cached_environment(
             (label, task, blanked), lambda: environment_for(policy, task, blanked=blanked)
@@ -96,8 +90,8 @@ def main() -> None:
     folders = {"bundled": str(saccade.demo_checkpoint())}
     for name, one in trial.items():
         folders.setdefault(one["label"], str((args.work / name).absolute()))
-    tasks = policy_in(folders["bundled"]).config.tasks
-    hashes = {label: policy_in(folder).checkpoint_sha256() for label, folder in folders.items()}
+    tasks = policy_of(folders["bundled"]).config.tasks
+    hashes = {label: policy_of(folder).checkpoint_sha256() for label, folder in folders.items()}
     cells = [
         Cell((label, arm, task), {"sha256": hashes[label]})
         for label in folders

@@ -11,7 +11,6 @@ Every part resumes where it stopped. README.md in this folder has the plan.
 from __future__ import annotations
 
 import argparse
-import functools
 import shutil
 import time
 from collections.abc import Iterator, Mapping, Sequence
@@ -35,6 +34,7 @@ from saccade_lab.sim.settings import GROUPS
 from saccade_lab.study.cell import Cell, Rows
 from saccade_lab.study.run import run_cells
 from saccade_lab.study.section import points, rate
+from saccade_lab.study.simulator import policy_of
 from saccade_lab.study.statistics import holm, paired_difference, verdict, wilson
 from saccade_lab.study.table import read_table, table_path
 from saccade_lab.training.settings import TrainingSettings
@@ -184,12 +184,6 @@ class Guided(Policy):
         return Chunk(np.clip(np.concatenate([answer[name][0] for name in GROUPS], axis=-1), -1.0, 1.0), spent)
 
 
-@functools.lru_cache(maxsize=1)
-def policy_in(folder: Path) -> Policy:
-    """A trained policy. The last one is kept."""
-    return Policy.from_pretrained(folder, num_threads=1)
-
-
 @dataclass(frozen=True)
 class Judge:
     """Runs the episodes of a cell: a policy under an arm, a task and a block of seeds."""
@@ -200,7 +194,7 @@ class Judge:
         """A row for each seed."""
         arm, name, task, first = cell.key
         weight, without = ARMS[int(arm)]
-        policy = policy_in(self.out / str(name))
+        policy = policy_of(str(self.out / str(name)))
         environment = cached_environment((str(name), str(task)), lambda: environment_for(policy, str(task)))
         scenario = environment.scenario
         assert isinstance(scenario, NamedBall)
@@ -226,7 +220,7 @@ class Judge:
 def judge(out: Path, args: argparse.Namespace) -> None:
     """Runs every episode that has not been run, of policies that are trained; those of the tests first."""
     trained = [policy for policy in POLICIES if (out / policy.name / "config.json").is_file()]
-    hashes = {one.name: policy_in(out / one.name).checkpoint_sha256() for one in trained}
+    hashes = {one.name: policy_of(str(out / one.name)).checkpoint_sha256() for one in trained}
     cells = [
         Cell((arm, one.name, task, first), {"sha256": hashes[one.name]})
         for repeated in (False, True)
