@@ -5,6 +5,7 @@
     python studies/guidance/guidance.py judge --out OUT --jobs -1    run the episodes of all arms
     python studies/guidance/guidance.py report --out OUT             print the tables of README.md
 
+The results of README.md are in studies/guidance, which is an OUT for `report`.
 Every part resumes where it stopped. README.md in this folder has the plan.
 """
 
@@ -36,7 +37,7 @@ from saccade_lab.study.run import run_cells
 from saccade_lab.study.section import points, rate
 from saccade_lab.study.simulator import policy_of
 from saccade_lab.study.statistics import holm, paired_difference, verdict, wilson
-from saccade_lab.study.table import read_table, table_path
+from saccade_lab.study.table import read_study
 from saccade_lab.training.settings import TrainingSettings
 
 TASKS = ("touch-yellow", "touch-blue")
@@ -244,7 +245,7 @@ def rows_of(table: pd.DataFrame, policy: str, agrees: bool) -> Iterator[tuple[An
 
 def report(out: Path) -> None:
     """Prints a table for each policy, and the tests."""
-    table = read_table(table_path(out, "guidance"))
+    table, _ = read_study(out, "guidance")
     tests: list[tuple[str, float]] = []
     for policy in table["policy"].unique():
         print(f"\n{policy}\n\n| {' | '.join(COLUMNS)} |\n|{'---|' * len(COLUMNS)}")
@@ -270,6 +271,12 @@ def report(out: Path) -> None:
                 print(f"| {' | '.join(cells)} |")
                 if not agrees and weight == PRIMARY and policy in TESTED:
                     tests.append((f"{policy}, without {without}", pair.p_value))
+        _, _, plain = next(rows_of(table, policy, agrees=False))
+        counts = [
+            f"{task} {part['success'].astype(bool).sum()} of {len(part)}"
+            for task, part in plain.groupby("task")
+        ]
+        print(f"\nThe other way at w = 1: {', '.join(counts)}")
     # A test whose policy is not trained yet, or whose episodes are missing, counts as one that found nothing.
     corrected = holm([p for _, p in tests] + [1.0] * (NUM_TESTS - len(tests)))
     for (name, p), after in zip(tests, corrected, strict=False):
