@@ -24,7 +24,8 @@ from typing import Any
 import numpy as np
 
 import saccade
-from saccade._internal.files import write_atomically, write_json
+from saccade._internal.files import sha256_of, write_json
+from saccade.errors import InputError
 from saccade_lab.sim import demos
 from saccade_lab.sim.recordings import Recording, write_recordings
 from saccade_lab.sim.tasks import find_task
@@ -34,7 +35,7 @@ from saccade_lab.training.settings import TrainingSettings
 TASKS = ("touch-yellow", "touch-blue")
 JUDGED = 10  # demonstrations of each task, none of them trained on
 BLACK = 2  # place of the camera that is black
-#: Those with which the guidance study's balanced policy learned the task on a GPU.
+#: Fewer and larger steps than the guidance study's, for a GPU. They are not tuned.
 SETTINGS = TrainingSettings(steps=2200, batch_size=64, learning_rate=1.2e-3, absent_share=0.0)
 #: The released default for a missing instruction, which is what `constant` is trained with.
 TEXT = "Perform the default behavior."
@@ -53,23 +54,37 @@ def changed(one: demos.Demonstration, policy: str) -> demos.Demonstration:
 
 
 def recorded(demonstrations: Path, task: str) -> tuple[list[Path], list[Path]]:
-    """The files of a task's demonstrations: those to train on, and those to judge on."""
+    """The files of a task's demonstrations: those to train on, and those to judge on.
+
+    A seed has the same scene in both tasks, so the split is that of the seeds.
+
+    Raises:
+        InputError: The tasks have demonstrations of different seeds.
+    """
+    seeds = {one: [path.name for path in demos.episode_files(demonstrations / "all", one)] for one in TASKS}
+    if len(seeds[task]) <= JUDGED or len({tuple(names) for names in seeds.values()}) != 1:
+        counts = {one: len(names) for one, names in seeds.items()}
+        raise InputError(
+            f"{demonstrations / 'all'}: expected the same seeds of both tasks, got {counts} files"
+        )
     paths = demos.episode_files(demonstrations / "all", task)
     return paths[:-JUDGED], paths[-JUDGED:]
 
 
 def derived(demonstrations: Path, out: Path, policy: str) -> Path:
-    """The training demonstrations of a policy."""
+    """The training demonstrations of a policy, written anew."""
+    folder = out / "demos" / policy
+    shutil.rmtree(folder, ignore_errors=True)
     for task in TASKS:
-        folder = out / "demos" / policy / task
-        folder.mkdir(parents=True, exist_ok=True)
-        shutil.copyfile(demonstrations / "all" / task / "recording.json", folder / "recording.json")
+        (folder / task).mkdir(parents=True)
+        shutil.copyfile(demonstrations / "all" / task / "recording.json", folder / task / "recording.json")
         for source in recorded(demonstrations, task)[0]:
-            path = folder / source.name
-            if not path.exists():
-                with write_atomically(path) as temporary, temporary.open("wb") as file:
-                    np.savez(file, **vars(changed(demos.load(source), policy)))
-    return out / "demos" / policy
+            path = folder / task / source.name
+            if policy in ("black", "leak"):
+                np.savez_compressed(path, **vars(changed(demos.load(source), policy)))
+            else:
+                shutil.copyfile(source, path)
+    return folder
 
 
 def judged(demonstrations: Path, policy: str) -> Iterator[Recording]:
@@ -85,11 +100,9 @@ def judged(demonstrations: Path, policy: str) -> Iterator[Recording]:
             )
 
 
-def diagnosed(folder: Path, recordings: Path) -> dict[str, Any]:
+def diagnosed(policy: saccade.Policy, recordings: Path) -> dict[str, Any]:
     """Verdicts and effects."""
-    report = saccade.diagnose(
-        saccade.Policy.from_pretrained(folder, num_threads=1), saccade.datasets.open(recordings)
-    )
+    report = saccade.diagnose(policy, saccade.datasets.open(recordings))
     return {
         name: {
             "verdict": one.name,
@@ -102,7 +115,7 @@ def diagnosed(folder: Path, recordings: Path) -> dict[str, Any]:
 
 def train_all(demonstrations: Path, out: Path, names: Sequence[str], device: str) -> None:
     """Trains the policies of these names."""
-    import torch
+    import torch  # not at the top: judging needs no torch
 
     from saccade_lab.training.train import train
 
@@ -113,28 +126,51 @@ def train_all(demonstrations: Path, out: Path, names: Sequence[str], device: str
         train(folder, out / policy, settings, lambda progress: None, device=device)
 
 
-def judge_all(demonstrations: Path, out: Path, names: Sequence[str]) -> None:
-    """Diagnoses each policy on recordings like those of its training, and on those of ``healthy``."""
-    from saccade_lab.sim.environment import SIMULATION_HZ
+def trained(folder: Path) -> saccade.Policy:
+    """A policy whose training has ended.
 
+    Raises:
+        InputError: It has not.
+    """
+    step = json.loads((folder / "history.json").read_text(encoding="utf-8"))[-1]["step"]
+    if step != SETTINGS.steps:
+        raise InputError(f"{folder}: trained for {step} of {SETTINGS.steps} steps: train it to the end first")
+    return saccade.Policy.from_pretrained(folder, num_threads=1)
+
+
+def record(demonstrations: Path, folder: Path, seen: str) -> None:
+    """Writes the recordings to judge on."""
+    from saccade_lab.sim.environment import SIMULATION_HZ  # not at the top: training needs no simulator
+
+    settings = demos.read_settings(demonstrations / "all", list(TASKS))
+    cameras = [camera.name for camera in settings.cameras]
+    fps = SIMULATION_HZ // settings.frame_stride
+    shutil.rmtree(folder, ignore_errors=True)
+    write_recordings(folder, judged(demonstrations, seen), cameras, settings.image_size, fps, extra={})
+
+
+def judge_all(demonstrations: Path, out: Path, names: Sequence[str]) -> None:
+    """Diagnoses each policy on recordings like those of its training, and on those of ``healthy``. A verdict
+    is kept as long as weights, recordings and code are the same.
+    """
     path = out / "verdicts.json"
     found: dict[str, Any] = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
-    found["code"] = code_version()
-    for policy in names:
-        for seen in dict.fromkeys((policy, policy if policy == "leak" else "healthy")):
+    for name in names:
+        policy = trained(out / name)
+        for seen in dict.fromkeys((name, name if name == "leak" else "healthy")):
             recordings = out / "recordings" / seen
-            if not recordings.exists():
-                settings_of = demos.read_settings(demonstrations / "all", list(TASKS))
-                cameras = [camera.name for camera in settings_of.cameras]
-                fps = SIMULATION_HZ // settings_of.frame_stride
-                write_recordings(
-                    recordings, judged(demonstrations, seen), cameras, settings_of.image_size, fps, extra={}
-                )
-            name = f"{policy} on recordings of {seen}"
-            if name not in found:
-                found[name] = diagnosed(out / policy, recordings)
+            record(demonstrations, recordings, seen)
+            about = {
+                "sha256": sha256_of(out / name / "model.safetensors"),
+                "recordings": saccade.datasets.open(recordings).fingerprint(),
+                "code": code_version(),
+            }
+            title = f"{name} on recordings of {seen}"
+            if found.get(title, {}).get("about") != about:
+                found[title] = {"about": about, "inputs": diagnosed(policy, recordings)}
                 write_json(path, found)
-            print(name, {key: one["verdict"] for key, one in found[name].items()}, flush=True)
+            inputs = found[title]["inputs"]
+            print(title, {key: one["verdict"] for key, one in inputs.items()}, flush=True)
 
 
 def main() -> None:
@@ -145,7 +181,7 @@ def main() -> None:
     parser.add_argument("part", choices=("train", "judge"))
     parser.add_argument("demos", type=Path)
     parser.add_argument("out", type=Path)
-    parser.add_argument("--policies", nargs="*", choices=POLICIES, default=POLICIES, help="only these")
+    parser.add_argument("--policies", nargs="+", choices=POLICIES, default=POLICIES, help="only these")
     parser.add_argument("--device", default="cpu", help="torch's name of the device to train on")
     args = parser.parse_args()
     if args.part == "train":

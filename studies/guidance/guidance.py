@@ -5,7 +5,7 @@
     python studies/guidance/guidance.py judge --out OUT --jobs -1    run the episodes of all arms
     python studies/guidance/guidance.py report --out OUT             print the tables of README.md
 
-The results of README.md are in studies/guidance, which is an OUT for `report`.
+`report --out studies/guidance` reads the results of README.md.
 Every part resumes where it stopped. README.md in this folder has the plan.
 """
 
@@ -47,6 +47,8 @@ ON_THE_RIGHT = 180  # of a task's confounded demonstrations have the named ball 
 #: Trained from random weights, and from the weights of a policy that follows instructions.
 FROM_RANDOM = TrainingSettings(steps=16_000, absent_share=0.0)
 TUNED = TrainingSettings(steps=4000, learning_rate=3e-4, absent_share=0.0)
+#: Instead of the plan's steps with `train --large-steps`, for a GPU: fewer of them, four times as large.
+LARGE = {"steps": 3000, "batch_size": 64}
 EPISODES = 300  # of each task; the named ball is on the right in one of the two tasks of a seed
 BLOCK = 10  # seeds of a cell
 WEIGHTS = (0.0, 1.5, 2.0, 3.0, 5.0)
@@ -62,6 +64,7 @@ COLUMNS = (
     "follows, %",
     "minus w = 1",
     "verdict",
+    "right ball by task",
 )
 
 
@@ -140,20 +143,22 @@ def choose(recorded: Path, task: str, on_the_right: int) -> list[Path]:
     return found
 
 
-def train_all(out: Path, names: Sequence[str], device: str) -> None:
-    """Trains the policies of these names, or all, in the order of the plan."""
+def train_all(out: Path, names: Sequence[str], device: str, *, large: bool) -> None:
+    """Trains the policies of these names in the order of the plan."""
     import torch
 
     from saccade_lab.training.train import train
 
     torch.set_num_threads(1)
     for policy in POLICIES:
-        if names and policy.name not in names:
+        if policy.name not in names:
             continue
         is_tuned = policy.kind == "tuned"
         settings = replace(
             TUNED if is_tuned else FROM_RANDOM, seed=policy.seed, language_dropout=policy.language_dropout
         )
+        if large:
+            settings = replace(settings, learning_rate=2 * settings.learning_rate, **LARGE)
         began = time.monotonic()
         train(
             out / "demos" / policy.recording,
@@ -218,9 +223,9 @@ class Judge:
         return rows
 
 
-def judge(out: Path, args: argparse.Namespace) -> None:
-    """Runs every episode that has not been run, of policies that are trained; those of the tests first."""
-    trained = [policy for policy in POLICIES if (out / policy.name / "config.json").is_file()]
+def judge(out: Path, names: Sequence[str], args: argparse.Namespace) -> None:
+    """Runs every episode that has not been run, of those of these policies that are trained; tests first."""
+    trained = [one for one in POLICIES if one.name in names and (out / one.name / "config.json").is_file()]
     hashes = {one.name: policy_of(str(out / one.name)).checkpoint_sha256() for one in trained}
     cells = [
         Cell((arm, one.name, task, first), {"sha256": hashes[one.name]})
@@ -267,16 +272,14 @@ def report(out: Path) -> None:
                     rate(wilson(int(wins.sum()), touched)),
                     "" if without is None else points(pair.difference),
                     "" if without is None else verdict(pair.difference),
+                    ", ".join(
+                        f"{task} {part['success'].astype(bool).sum()} of {len(part)}"
+                        for task, part in arm.groupby("task")
+                    ),
                 ]
                 print(f"| {' | '.join(cells)} |")
                 if not agrees and weight == PRIMARY and policy in TESTED:
                     tests.append((f"{policy}, without {without}", pair.p_value))
-        _, _, plain = next(rows_of(table, policy, agrees=False))
-        counts = [
-            f"{task} {part['success'].astype(bool).sum()} of {len(part)}"
-            for task, part in plain.groupby("task")
-        ]
-        print(f"\nThe other way at w = 1: {', '.join(counts)}")
     # A test whose policy is not trained yet, or whose episodes are missing, counts as one that found nothing.
     corrected = holm([p for _, p in tests] + [1.0] * (NUM_TESTS - len(tests)))
     for (name, p), after in zip(tests, corrected, strict=False):
@@ -288,16 +291,25 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("part", choices=("demos", "train", "judge", "report"))
     parser.add_argument("--out", type=Path, default=Path("out/guidance"))
-    parser.add_argument("--policies", nargs="*", default=[], help="train only these")
+    names = [one.name for one in POLICIES]
+    parser.add_argument(
+        "--policies",
+        nargs="+",
+        choices=names,
+        default=names,
+        help="train or judge only these",
+        metavar="NAME",
+    )
+    parser.add_argument("--large-steps", action="store_true", help=f"train by {LARGE}")
     parser.add_argument("--device", default="cpu", help="torch's name of the device to train on")
     add_worker_arguments(parser, "episodes")
     args = parser.parse_args()
     if args.part == "demos":
         record(args.out, args)
     elif args.part == "train":
-        train_all(args.out, args.policies, args.device)
+        train_all(args.out, args.policies, args.device, large=args.large_steps)
     elif args.part == "judge":
-        judge(args.out, args)
+        judge(args.out, args.policies, args)
     else:
         report(args.out)
 

@@ -119,7 +119,8 @@ unsafe fn peak<S: Simd, E: Step<Broadcast>, const NV: usize, const MR: usize>(si
         // sums.
         unsafe { E::multiply_add::<S, NV, MR>(simd, &mut sums, &rows, 0, weights, 1) };
     }
-    // A copy: sums whose address is known anywhere would be stored in every step, and the peak be half of it.
+    // A copy's address is taken: what `black_box` may see is kept in memory, and every step would store the sums
+    // (23 instead of 59 GMAC/s in float32, one thread of a Zen 4).
     let made = sums;
     black_box(&made);
     STEPS * MR * NV * S::LANES * E::DEPTH

@@ -29,9 +29,9 @@ const _: () = assert!(COLUMNS <= MAX_NR && MAX_ROWS <= MAX_MR);
 const STEP_WORDS: usize = TILE * COLUMNS;
 
 /// Steps of a part of a panel at most: 192 kB, and in as many steps a line of each of 48 streams of 4 kB.
-/// Parts of 4 to 12 steps, which the nearest cache holds while all rows pass, are no faster: `encode` of N1.5
-/// takes 1.08 to 1.12 (int8) and 1.06 to 1.16 (bfloat16) of the time (Emerald Rapids, 2 threads, the fastest
-/// rounds), since sums go to memory and back more often.
+/// Parts of 4 to 12 steps, which the nearest cache holds while all rows pass, are slower: `encode` of N1.5 takes
+/// 1.08 to 1.12 (int8) and 1.06 to 1.16 (bfloat16) of the time with 64 (Emerald Rapids, 2 threads, the fastest of
+/// 5 interleaved rounds on a shared machine), probably since sums go to memory and back more often.
 const PART_STEPS: usize = 64;
 
 /// Bytes of the rows that go through a panel together at most. Products in tiles are so fast that weights

@@ -123,7 +123,7 @@ unsafe fn peak<S: Simd, E: Step<Lanes>, const NV: usize, const MR: usize>(simd: 
         // SAFETY: there is a vector for each group, and as many words of weights as any step has.
         unsafe { E::multiply_add::<S, NV, MR>(simd, &mut sums, &rows, 0, weights, E::DEPTH) };
     }
-    // A copy, as in the other micro-kernel.
+    // A copy, as `peak` of `broadcast.rs` makes.
     let made = sums;
     black_box(&made);
     STEPS * MR * E::GROUP * COLUMNS * E::DEPTH
