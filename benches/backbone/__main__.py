@@ -1,6 +1,6 @@
 """The vision-language backbone: speed against transformers, reuse, memory, errors.
 
-`report --write` writes docs/results/backbone.md and benches/backbone/results.json; neither is committed yet.
+`report --write` writes docs/results/backbone.md and benches/backbone/results.json.
 
     python -m benches.backbone                        all sections; about half an hour on two cores
     python -m benches.backbone speed --rounds 9       some sections: speed, reuse, memory, accuracy

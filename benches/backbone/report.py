@@ -1,4 +1,4 @@
-"""The report docs/results/backbone.md, from the JSON of the measurements; neither is committed yet."""
+"""The report docs/results/backbone.md, from the JSON of the measurements."""
 
 from __future__ import annotations
 
