@@ -14,6 +14,7 @@ unchanged ones. Every part resumes where it stopped. README.md says what was exp
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import shutil
 from collections.abc import Iterator, Sequence
@@ -28,6 +29,7 @@ from saccade._internal.files import sha256_of, write_json
 from saccade.errors import InputError
 from saccade_lab.sim import demos
 from saccade_lab.sim.recordings import Recording, write_recordings
+from saccade_lab.sim.settings import TENSOR_FILE
 from saccade_lab.sim.tasks import find_task
 from saccade_lab.study.code_version import code_version
 from saccade_lab.training.settings import TrainingSettings
@@ -61,13 +63,13 @@ def recorded(demonstrations: Path, task: str) -> tuple[list[Path], list[Path]]:
     Raises:
         InputError: The tasks have demonstrations of different seeds.
     """
-    seeds = {one: [path.name for path in demos.episode_files(demonstrations / "all", one)] for one in TASKS}
-    if len(seeds[task]) <= JUDGED or len({tuple(names) for names in seeds.values()}) != 1:
-        counts = {one: len(names) for one, names in seeds.items()}
+    found = {one: demos.episode_files(demonstrations / "all", one) for one in TASKS}
+    paths = found[task]
+    if len(paths) <= JUDGED or len({tuple(path.name for path in files) for files in found.values()}) != 1:
+        counts = {one: len(files) for one, files in found.items()}
         raise InputError(
             f"{demonstrations / 'all'}: expected the same seeds of both tasks, got {counts} files"
         )
-    paths = demos.episode_files(demonstrations / "all", task)
     return paths[:-JUDGED], paths[-JUDGED:]
 
 
@@ -155,13 +157,15 @@ def judge_all(demonstrations: Path, out: Path, names: Sequence[str]) -> None:
     """
     path = out / "verdicts.json"
     found: dict[str, Any] = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
+    seen_by = {name: dict.fromkeys((name, name if name == "leak" else "healthy")) for name in names}
+    for seen in dict.fromkeys(itertools.chain.from_iterable(seen_by.values())):
+        record(demonstrations, out / "recordings" / seen, seen)
     for name in names:
         policy = trained(out / name)
-        for seen in dict.fromkeys((name, name if name == "leak" else "healthy")):
+        for seen in seen_by[name]:
             recordings = out / "recordings" / seen
-            record(demonstrations, recordings, seen)
             about = {
-                "sha256": sha256_of(out / name / "model.safetensors"),
+                "sha256": sha256_of(out / name / TENSOR_FILE),
                 "recordings": saccade.datasets.open(recordings).fingerprint(),
                 "code": code_version(),
             }

@@ -37,7 +37,7 @@ from saccade_lab.study.run import run_cells
 from saccade_lab.study.section import points, rate
 from saccade_lab.study.simulator import policy_of
 from saccade_lab.study.statistics import holm, paired_difference, verdict, wilson
-from saccade_lab.study.table import read_study
+from saccade_lab.study.table import read_study, truths
 from saccade_lab.training.settings import TrainingSettings
 
 TASKS = ("touch-yellow", "touch-blue")
@@ -251,6 +251,7 @@ def rows_of(table: pd.DataFrame, policy: str, agrees: bool) -> Iterator[tuple[An
 def report(out: Path) -> None:
     """Prints a table for each policy, and the tests."""
     table, _ = read_study(out, "guidance")
+    table = table.assign(success=truths(table["success"]), wrong=truths(table["wrong"]))
     tests: list[tuple[str, float]] = []
     for policy in table["policy"].unique():
         print(f"\n{policy}\n\n| {' | '.join(COLUMNS)} |\n|{'---|' * len(COLUMNS)}")
@@ -260,9 +261,9 @@ def report(out: Path) -> None:
             for weight, without, arm in arms:
                 if len(plain) != EPISODES or len(arm) != EPISODES:
                     continue  # not run to its end
-                wins, wrong = arm["success"].astype(bool), arm["wrong"].astype(bool)
+                wins, wrong = arm["success"], arm["wrong"]
                 touched = int(wins.sum() + wrong.sum())
-                pair = paired_difference(wins.tolist(), plain["success"].astype(bool).tolist())
+                pair = paired_difference(wins.tolist(), plain["success"].tolist())
                 cells = [
                     "as demonstrated" if agrees else "the other way",
                     without or "",
@@ -273,8 +274,7 @@ def report(out: Path) -> None:
                     "" if without is None else points(pair.difference),
                     "" if without is None else verdict(pair.difference),
                     ", ".join(
-                        f"{task} {part['success'].astype(bool).sum()} of {len(part)}"
-                        for task, part in arm.groupby("task")
+                        f"{task} {part['success'].sum()} of {len(part)}" for task, part in arm.groupby("task")
                     ),
                 ]
                 print(f"| {' | '.join(cells)} |")
