@@ -95,6 +95,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help = f"{what} ({default_of(flag)})"
         arguments.add_number(parser, flag, minimum=lowest, below=limit, help=help)
     parser.add_argument(
+        "--dtype",
+        choices=("float32", "bfloat16"),
+        help="of products while training on a CPU; bfloat16 saves a third of the time where the CPU multiplies it "
+        "(default: float32)",
+    )
+    parser.add_argument(
         "--version",
         choices=("n1.5", "n1.7"),
         help="release of GR00T whose layout the checkpoint has; n1.7 only on LIBERO, where it is the default",
@@ -175,7 +181,7 @@ def training_settings(args: argparse.Namespace, *, on_libero: bool = False) -> T
     """
     from saccade_lab.training.settings import LIBERO_SETTINGS, TrainingSettings
 
-    flags = [flag for flag, *_ in (*INTEGERS, *NUMBERS)] + ["--version", "--view-size"]
+    flags = [flag for flag, *_ in (*INTEGERS, *NUMBERS)] + ["--dtype", "--version", "--view-size"]
     given = {setting(flag): getattr(args, destination(flag)) for flag in flags}
     defaults = LIBERO_SETTINGS if on_libero else TrainingSettings()
     return replace(defaults, **{name: value for name, value in given.items() if value is not None})

@@ -19,6 +19,7 @@ from saccade.errors import InputError
 from saccade_lab.libero.checkpoint import ACTION_GROUPS, CAMERAS, CONTROL_HZ, STATE_GROUPS, policy_actions
 from saccade_lab.libero.expert import INTO_BASKET, ONTO_PLATE, Expert, Technique
 from saccade_lab.libero.grasps import Points
+from saccade_lab.libero.misses import miss
 from saccade_lab.libero.placements import TRADE_SHARE, wider
 from saccade_lab.libero.recording import LiberoRecording
 from saccade_lab.libero.scene import Scene
@@ -39,11 +40,13 @@ class SuiteExpert:
         technique: How the object is taken and let go.
         trade_share: Share of the demonstrations in which objects trade places. 0 if instructions say where an
             object stands.
+        miss_share: Share of the demonstrations that begin after a grasp that missed.
         radius: Metres from the middle of an object that others stay away, by its ground plan ``(n, 2)``.
     """
 
     technique: Technique
     trade_share: float
+    miss_share: float
     radius: Callable[[Points], float]
 
 
@@ -58,10 +61,11 @@ def largest_distance(plan: Points) -> float:
     return float(np.linalg.norm(plan - middle, axis=1).max())
 
 
+MISS_SHARE = 1 / 3
 EXPERTS: Mapping[str, SuiteExpert] = {
-    "libero_object": SuiteExpert(INTO_BASKET, TRADE_SHARE, half_diagonal),
+    "libero_object": SuiteExpert(INTO_BASKET, TRADE_SHARE, MISS_SHARE, half_diagonal),
     # Its objects are round and near to each other: with half a diagonal there is no room to move them.
-    "libero_spatial": SuiteExpert(ONTO_PLATE, 0.0, largest_distance),
+    "libero_spatial": SuiteExpert(ONTO_PLATE, 0.0, 0.0, largest_distance),
 }
 DEFAULT_COUNT = 40
 IMAGE_SIZE, FRAME_STRIDE = 256, 5
@@ -133,13 +137,19 @@ def record_episode(
 ) -> demos.Demonstration | None:
     """Records one episode of the expert; None if it did not succeed. For ``environment`` see ``start``."""
     scene = start(environment, settings, seed)
+    technique, miss_share = EXPERTS[settings.suite].technique, EXPERTS[settings.suite].miss_share
+    expert, rng = Expert(scene, technique), np.random.default_rng((settings.task, seed, 2))
+    if rng.random() < miss_share:
+        if not miss(scene, technique, environment.advance, rng):
+            return None
+        expert.begin_again()
 
     def look() -> demos.Look:
         seen = environment.observe()
         return np.stack([seen["images"][name] for name in CAMERAS]), seen["state"], scene.targets()
 
     return demos.demonstrated(
-        Expert(scene, EXPERTS[settings.suite].technique).action,
+        expert.action,
         environment.advance,
         look,
         NoiseBursts(np.random.default_rng((settings.task, seed, 1)), **BURSTS),

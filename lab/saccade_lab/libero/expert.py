@@ -118,10 +118,8 @@ class Expert:
         self._world, self._technique = world, technique
         seen = world.situation()
         self._down = downward(seen.rotation)
-        self._hand = seen.hand
         self._held_at = seen.hand  # where it closed or opened the gripper last
-        self._begin("above")
-        self._plan(seen)
+        self._start(seen)
 
     def action(self) -> Float32Array:
         """Its action in the current state, ``(7,)`` in [-1, 1]; see ``LiberoEnvironment``."""
@@ -133,6 +131,15 @@ class Expert:
         goal, grip = self._move(seen, speed, float(np.linalg.norm(turn)))
         motion = np.concatenate((GAIN * (goal - seen.hand), TURN_GAIN * turn))
         return np.concatenate((np.clip(motion, -1, 1), [grip])).astype(np.float32)
+
+    def begin_again(self) -> None:
+        """Begins again from the current state; the hand's turns count from where they did before."""
+        self._start(self._world.situation())
+
+    def _start(self, seen: Situation) -> None:
+        self._hand = seen.hand
+        self._begin("above")
+        self._plan(seen)
 
     def _begin(self, phase: str) -> None:
         self.phase, self._steps = phase, 0

@@ -53,14 +53,14 @@ def prepared_inputs(
     Raises:
         ShapeError, InputError: As ``Backbone.prepare``.
     """
-    views, core = images.flatten(0, 1), backbone.core
+    # As a tensor: a GPU multiplies by the inverse of a number, which rounds otherwise.
+    centre = torch.full((), float(PIXEL_CENTRE), device=images.device)
+    views, core = images.flatten(0, 1).float().sub_(centre).div_(centre), backbone.core
     if isinstance(core, Eagle):
         shown, grids = views, core.grids(views)
     else:
         shown, grids = patches(views), [grid_of(views)] * len(views)
-    # As a tensor: a GPU multiplies by the inverse of a number, which rounds otherwise.
-    centre = torch.full((), float(PIXEL_CENTRE), device=views.device)
-    return backbone.with_prompts([(shown.float() - centre) / centre], grids, *padded(prompts, length))
+    return backbone.with_prompts([shown], grids, *padded(prompts, length))
 
 
 def grid_of(views: Tensor) -> tuple[int, int]:

@@ -26,7 +26,7 @@ def features_name(start_sha256: str, recording_sha256: str, samples: str) -> str
 CATEGORY_STD = 0.02  # of the released code: `saccade_lab.reference.layers.TABLE_STD`, which needs torch
 RELEASED_WIDTH = 1536  # of GR00T N1.5
 #: Settings that were added after the first runs; see ``TrainingSettings.to_dict``.
-ADDED = ("category_std", "language_dropout", "shift", "version", "view_size")
+ADDED = ("category_std", "dtype", "language_dropout", "shift", "version", "view_size")
 
 
 def released_std(width: int) -> float:
@@ -87,6 +87,8 @@ class TrainingSettings:
         execute_steps: Actions of a chunk that are executed before the next observation.
         num_steps: Euler steps at run time.
         patch_size: Pixels along each side of the patch behind an image token, an even number.
+        dtype: ``"float32"``, or ``"bfloat16"`` for products in bfloat16, by torch's autocast. Weights and the
+            optimiser's state stay in float32.
         version: ``"n1.5"`` or ``"n1.7"``, of which only policies of LIBERO can be.
         view_size: Pixels along each side of a frame as the tower of a LIBERO policy sees it, a multiple of
             ``patch_size``; 0 for policies of Meta-World, which see the recorded size.
@@ -121,12 +123,15 @@ class TrainingSettings:
     execute_steps: int = 4
     num_steps: int = 4
     patch_size: int = 16
+    dtype: Literal["float32", "bfloat16"] = "float32"
     version: str = "n1.5"
     view_size: int = 0
 
     def __post_init__(self) -> None:
         if self.only not in ("", "backbone", "head"):
             raise InputError(f"only: given {self.only!r}, expected '', 'backbone' or 'head'")
+        if self.dtype not in ("float32", "bfloat16"):
+            raise InputError(f"dtype: given {self.dtype!r}, expected 'float32' or 'bfloat16'")
         for name, share in (
             ("absent_share", self.absent_share),
             ("language_dropout", self.language_dropout),

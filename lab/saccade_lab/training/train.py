@@ -132,7 +132,13 @@ def with_statistics(config: PolicyConfig, samples: Samples) -> PolicyConfig:
 def new_run(
     settings: TrainingSettings, config: PolicyFiles, demonstrations: dict[str, Any], device: str = "cpu"
 ) -> Run:
-    """A run before its first step; for ``demonstrations`` see ``dataset.describe``."""
+    """A run before its first step; for ``demonstrations`` see ``dataset.describe``.
+
+    Raises:
+        InputError: bfloat16 on another device than a CPU, which was never tried.
+    """
+    if settings.dtype != "float32" and torch.device(device).type != "cpu":
+        raise InputError(f"dtype: given {settings.dtype!r} with device {device!r}, expected 'float32'")
     learner = new_learner(settings, config).to(device)
     matrices = [parameter for parameter in learner.parameters() if parameter.ndim >= 2]
     others = [parameter for parameter in learner.parameters() if parameter.ndim < 2]
@@ -159,7 +165,8 @@ def learning_rate(settings: TrainingSettings, step: int) -> float:
 def gradients(run: Run, given: tuple[Batch, Tensor, Tensor]) -> dict[str, Tensor]:
     """The losses by name, of a batch with its noise and times; writes the gradients of their sum."""
     settings = run.settings
-    losses = run.learner.losses(*given, run.average)
+    with torch.autocast("cpu", torch.bfloat16, enabled=settings.dtype == "bfloat16"):
+        losses = run.learner.losses(*given, run.average)
     weights = {"target_loss": settings.target_weight, "alignment_loss": settings.alignment_weight}
     total = losses["loss"]
     for name, weight in weights.items():

@@ -19,6 +19,8 @@ from saccade_lab.libero.expert import (
     rotation_vector,
 )
 from saccade_lab.libero.grasps import Points
+from saccade_lab.libero.misses import HOLDING, STEPS, Imagined, miss
+from saccade_lab.sim.scenarios import StepOutcome
 from tests.helpers.paths import ROOT
 
 STEP, TURN = 0.05, 0.5  # of the controller for an action of 1
@@ -173,6 +175,52 @@ def test_it_begins_again_if_the_box_falls_over() -> None:
     world.body[2] = 0.02
     expert.action()
     assert expert.phase == "above"
+
+
+def test_it_solves_the_task_after_a_grasp_that_missed() -> None:
+    missed, closed = 0, 0
+    for seed in range(20):
+        world = Toy((-0.05, -0.15))
+        expert = Expert(world, INTO_BASKET)
+        executed: list[Float32Array] = []
+
+        def advance(
+            action: Float32Array, world: Toy = world, executed: list[Float32Array] = executed
+        ) -> StepOutcome:
+            executed.append(action)
+            world.step(action)
+            return StepOutcome(0.0, world.solved())
+
+        if not miss(world, INTO_BASKET, advance, np.random.default_rng(seed)):
+            assert world.solved()  # by accident: the hand closed near enough
+            continue
+        missed += 1
+        closed += any(action[6] > 0 for action in executed)
+        assert len(executed) in range(*STEPS)
+        expert.begin_again()
+        for _ in range(400):
+            world.step(expert.action())
+            if world.solved():
+                break
+        assert world.solved()
+    assert missed >= 15
+    assert 5 < closed < missed
+
+
+def test_a_missed_grasp_is_carried_to_the_goal() -> None:
+    world = Toy((-0.05, -0.15))
+    start, closed, heights = world.body.copy(), 0, list[float]()
+    imagined = Imagined(world, np.array([0.07, 0.0, 0.0]))
+    expert = Expert(imagined, INTO_BASKET)
+    while expert.phase != "retreat":
+        world.step(expert.action())
+        imagined.held = expert.phase in HOLDING
+        closed += expert.phase == "carry"
+        heights.append(world.hand[2])
+    np.testing.assert_array_equal(world.body, start)
+    assert np.abs(world.hand - world.basket)[:2].max() < 0.05
+    assert closed
+    assert max(heights) > world.basket[2] + 0.1
 
 
 def test_a_phase_ends_after_its_limit() -> None:

@@ -31,7 +31,11 @@ def recording() -> Path:
     return recorded()
 
 
-@pytest.mark.parametrize("settings", [TINY, ALIGNED], ids=["plain", "aligned"])
+@pytest.mark.parametrize(
+    "settings",
+    [TINY, ALIGNED, dataclasses.replace(TINY, dtype="bfloat16")],
+    ids=["plain", "aligned", "bfloat16"],
+)
 def test_training_resumes_to_the_same_weights(
     recording: Path, tmp_path: Path, settings: TrainingSettings
 ) -> None:
@@ -54,6 +58,26 @@ def test_training_resumes_to_the_same_weights(
     ends = [torch.load(tmp_path / name / "training.pt", weights_only=True) for name in ("whole", "parts")]
     for name, tensor in ends[0]["learner"].items():  # including what is trained besides the policy
         assert torch.equal(tensor, ends[1]["learner"][name]), name
+
+
+def test_bfloat16_narrows_products_only(recording: Path) -> None:
+    torch.set_num_threads(1)
+    found = {}
+    for dtype in ("float32", "bfloat16"):
+        run, batches = make_batches(recording, dataclasses.replace(TINY, dtype=dtype), with_later=False)
+        found[dtype] = [train.train_step(run, batches.draw(0, step))["loss"] for step in range(3)]
+        for one in (*run.learner.parameters(), *run.average.values()):
+            assert one.dtype == torch.float32
+            assert one.grad is None or one.grad.dtype == torch.float32
+    assert found["bfloat16"] != found["float32"]
+    np.testing.assert_allclose(found["bfloat16"], found["float32"], rtol=0.02)
+
+
+def test_bfloat16_on_another_device_than_a_cpu_is_refused(recording: Path) -> None:
+    settings = dataclasses.replace(TINY, dtype="bfloat16")
+    run, _ = make_batches(recording, TINY, with_later=False)
+    with pytest.raises(InputError, match="dtype: given 'bfloat16' with device 'cuda', expected 'float32'"):
+        train.new_run(settings, run.config, run.demonstrations, "cuda")
 
 
 def test_the_followed_tensors_stay_those_of_the_learner(recording: Path, tmp_path: Path) -> None:
