@@ -82,6 +82,21 @@ def test_a_recording_shows_what_happened(tmp_path: Path) -> None:
     environment.close()
 
 
+def test_a_third_begins_after_a_grasp_that_missed() -> None:
+    missed = SEED + 6  # the first such seed of this task
+    environment = LiberoEnvironment("libero_object", 6, image_size=32, settle_steps=0, official_states=False)
+    at_rest = demos.start(environment, SMALL, missed).situation()
+    episode = demos.record_episode(environment, SMALL, missed)
+    assert episode is not None
+    usual = demos.record_episode(environment, SMALL, SEED)
+    environment.close()
+    assert usual is not None
+    assert np.linalg.norm(usual.proprio[0, :3] - at_rest.hand) < 0.01
+    begun_at = episode.proprio[0, :3]
+    assert np.linalg.norm(begun_at - at_rest.hand) > 0.03  # metres: the hand has moved before the recording
+    assert np.linalg.norm(episode.targets[0, :3] - at_rest.body) < 0.1  # and has not carried the object away
+
+
 def test_starts_are_wider_than_the_official_ones() -> None:
     environment = LiberoEnvironment("libero_object", 1, settle_steps=0, official_states=False)
     places = []
