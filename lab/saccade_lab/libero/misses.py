@@ -1,7 +1,7 @@
 """Grasps that miss, for demonstrations that begin after one; NumPy only.
 
-A policy that was trained on demonstrations of an expert alone has never seen an empty hand that is closed: when it
-misses, it carries nothing to the goal.
+A policy that was trained on demonstrations without misses has never seen a closed hand that is empty: when it
+misses, it carries nothing to the goal, and stays there.
 """
 
 from __future__ import annotations

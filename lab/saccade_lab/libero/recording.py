@@ -18,8 +18,8 @@ from saccade_lab.training import dataset
 from saccade_lab.training.dataset import Samples
 
 SETTINGS_FILE = "recording.json"
-#: Version of what else decides an episode: the expert, its grasps and misses, placements, bursts, numbers of steps.
-#: Whoever changes one of them raises it, so that a recording does not go on with other episodes.
+#: Version of what else decides an episode: the expert, its grasps and misses, placements, bursts, numbers of
+#: steps. Whoever changes one of them raises it, so that a recording does not go on with other episodes.
 EXPERT = 2
 
 
