@@ -1,9 +1,9 @@
 """The same action head and backbone in plain torch: they are trained, and the Rust ones tested against them.
 
 They favour clarity over speed: nothing is cached, and every row is computed in every block. ``head`` is the
-sampler and the loss, ``guidance`` its second context, ``layers`` the modules, ``intervene`` the effect of an
-intervention in each block; ``backbone`` is what turns images and an instruction into features. Needs torch
-and safetensors.
+sampler and the loss, ``velocity`` the network that both evaluate, ``guidance`` the sampler's second context,
+``layers`` the modules, ``intervene`` the effect of an intervention in each block; ``backbone`` is what turns
+images and an instruction into features. Needs torch and safetensors.
 """
 
 from saccade_lab.extras import LAB
