@@ -15,7 +15,7 @@ import torch
 from lerobot.policies.groot import processor_groot as released
 
 from saccade import Normalizer
-from tests.helpers import layouts
+from tests.helpers import layout_files, layouts
 
 IS_N15 = importlib.metadata.version("lerobot").startswith(("0.4", "0.5"))
 BATCH, STEPS = 3, 7
@@ -42,7 +42,7 @@ def flat(seed: int) -> dict[str, dict[str, torch.Tensor]]:
     """The statistics that `layouts` writes for a lerobot checkpoint."""
     found: dict[str, dict[str, torch.Tensor]] = {"observation.state": {}, "action": {}}
     for key, width, offset in (("observation.state", 7, 0), ("action", 6, 100)):
-        for name, values in layouts.flat_statistics(key, width, seed + offset).items():
+        for name, values in layout_files.flat_statistics(key, width, seed + offset).items():
             found[key][name.rpartition(".")[2]] = values
     return found
 
@@ -95,11 +95,11 @@ def test_n17_groups(relative: str, use_percentiles: bool, tmp_path: Path) -> Non
     if relative != "no":
         absolute = {"rep": "ABSOLUTE", "type": "NON_EEF", "format": "DEFAULT", "state_key": None}
         modality["action"]["action_configs"] = [{**absolute, "rep": "RELATIVE", "state_key": "arm"}, absolute]
-        rows = [layouts.group_statistics({"arm": 5}, seed)["arm"] for seed in range(16)]
+        rows = [layout_files.group_statistics({"arm": 5}, seed)["arm"] for seed in range(16)]
         own = {name: [row[name] for row in rows] for name in rows[0]}
         numbers["relative_action"] = {"arm": own if relative == "a row a step" else rows[0]}
-    layouts.write_json(tmp_path / "processor_config.json", config)
-    layouts.write_json(tmp_path / "statistics.json", statistics)
+    layout_files.write_json(tmp_path / "processor_config.json", config)
+    layout_files.write_json(tmp_path / "statistics.json", statistics)
     normalizer = Normalizer.from_pretrained(tmp_path, "new_embodiment")
 
     about = {"raw_stats": numbers, "modality_config": modality, "use_percentiles": use_percentiles}

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from saccade import Normalizer
-from tests.helpers import layouts
+from tests.helpers import layout_files
 
 Array = NDArray[np.float32]
 
@@ -128,7 +128,7 @@ def processor(**changes: Any) -> tuple[dict[str, Any], dict[str, Any]]:
 
 
 def load_processor(folder: Path, config: dict[str, Any], statistics: dict[str, Any]) -> Normalizer:
-    layouts.write_json(folder / "processor_config.json", config)
-    layouts.write_json(folder / "statistics.json", statistics)
-    layouts.write_json(folder / "embodiment_id.json", {"robot": 5, "other": 6})
+    layout_files.write_json(folder / "processor_config.json", config)
+    layout_files.write_json(folder / "statistics.json", statistics)
+    layout_files.write_json(folder / "embodiment_id.json", {"robot": 5, "other": 6})
     return Normalizer.from_pretrained(folder)

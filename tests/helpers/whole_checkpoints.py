@@ -19,7 +19,7 @@ from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
-from tests.helpers import layout_heads, layouts
+from tests.helpers import layout_files, layout_heads, layouts
 
 DATA = Path(__file__).parents[1] / "data" / "backbone"
 
@@ -160,4 +160,4 @@ def _layers(layout: str) -> int:
 def _edit(path: Path, change: Callable[[Config], None]) -> None:
     values = json.loads(path.read_text())
     change(values)
-    layouts.write_json(path, values)
+    layout_files.write_json(path, values)

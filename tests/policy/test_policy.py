@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 import saccade
 from saccade import ActionHead, Normalizer, Policy
 from saccade_lab.sim.policy import DEMO_CHECKPOINT
-from tests.helpers import layouts
+from tests.helpers import layout_files
 from tests.helpers.published import published
 
 Array = NDArray[np.float32]
@@ -126,10 +126,10 @@ def test_what_is_relative_to_the_state_stays_where_it_is_in_the_room(tmp_path: P
         relative,
         {**relative, "rep": "ABSOLUTE"},
     ]
-    layouts.write_json(tmp_path / "processor_config.json", config)
+    layout_files.write_json(tmp_path / "processor_config.json", config)
     statistics = json.loads((tmp_path / "statistics.json").read_text())
     statistics["new_embodiment"]["relative_action"] = {"arm": {"min": [-3.0] * 5, "max": [3.0] * 5}}
-    layouts.write_json(tmp_path / "statistics.json", statistics)
+    layout_files.write_json(tmp_path / "statistics.json", statistics)
     head = load("n17")
     policy = Policy(head, tmp_path, "new_embodiment")
     context = head.encode(features(head), **masks(head))

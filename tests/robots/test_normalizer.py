@@ -14,7 +14,7 @@ from safetensors.numpy import save_file
 import saccade
 from saccade import Normalizer
 from saccade_lab.sim.policy import DEMO_CHECKPOINT
-from tests.helpers import layouts
+from tests.helpers import layout_files
 from tests.helpers.normalizer_cases import as_array, data_config, draw, metadata, row
 from tests.helpers.published import sidecars
 
@@ -153,7 +153,7 @@ def test_a_wide_state_is_cut_off_as_the_code_bases_do() -> None:
 def test_statistics_may_have_any_dtype(tmp_path: Path) -> None:
     sidecars(tmp_path, "lerobot")
     expected = as_array(Normalizer.from_pretrained(tmp_path).state(draw(1, 7)))
-    statistics = layouts.flat_statistics("observation.state", 7, 0) | layouts.flat_statistics(
+    statistics = layout_files.flat_statistics("observation.state", 7, 0) | layout_files.flat_statistics(
         "action", 6, 100
     )
     doubles = {name: values.double().numpy() for name, values in statistics.items()}

@@ -17,7 +17,7 @@ import torch
 
 import saccade
 from saccade import Normalizer
-from tests.helpers import layouts
+from tests.helpers import layout_files
 from tests.helpers.normalizer_cases import as_array, draw, edit, step_config
 from tests.helpers.paths import DATA
 from tests.helpers.published import sidecars
@@ -85,7 +85,7 @@ def test_a_lerobot_checkpoint_gives_the_bits_of_lerobots_own_steps(
     for key in statistics:
         width = 7 if key == "observation.state" else 6
         seed = 3 if key == "observation.state" else 103
-        for name, values in layouts.flat_statistics(key, width, seed).items():
+        for name, values in layout_files.flat_statistics(key, width, seed).items():
             statistics[key][name.rpartition(".")[2]] = values
     pack = lerobot_steps.GrootPackInputsStep(
         state_horizon=1, action_horizon=5, max_state_dim=12, max_action_dim=8, stats=statistics
@@ -143,11 +143,11 @@ def test_without_min_max_n17_leaves_the_numbers_alone(tmp_path: Path) -> None:
 def test_lerobot_after_0_5_1_clips_states(tmp_path: Path) -> None:
     sidecars(tmp_path, "lerobot-n17", seed=5)
     normalizer, state = Normalizer.from_pretrained(tmp_path), draw(50, 7, scale=5.0)
-    low, high = (layouts.flat_statistics("s", 7, 5)[f"s.{name}"].numpy() for name in ("min", "max"))
+    low, high = (layout_files.flat_statistics("s", 7, 5)[f"s.{name}"].numpy() for name in ("min", "max"))
     expected = np.clip(2 * (state[:, :6] - low[:6]) / (high[:6] - low[:6]) - 1, -1, 1)
     assert np.allclose(as_array(normalizer.state(state))[:, :6], expected, atol=1e-6)
     assert not as_array(normalizer.state(state))[:, 6:].any()
-    assert normalizer.embodiment_id == layouts.N17_EMBODIMENTS["new_embodiment"]
+    assert normalizer.embodiment_id == layout_files.N17_EMBODIMENTS["new_embodiment"]
 
 
 def test_a_policy_without_its_config_is_refused(tmp_path: Path) -> None:
