@@ -30,6 +30,7 @@ from transformers.feature_extraction_utils import BatchFeature
 from saccade.integrations import Accelerated, accelerate
 from saccade_lab.reference.random_weights import sized_config, small_config
 from tests.helpers import integration_cases as cases
+from tests.helpers.integration_refusals import check_refusals
 
 LEROBOT = importlib.metadata.version("lerobot")
 KIND = "n1.5" if LEROBOT.startswith(("0.4", "0.5")) else "n1.7"
@@ -278,7 +279,7 @@ def test_copies_hold_the_original(case: cases.Case) -> None:
 
 
 def test_refusals(case: cases.Case) -> None:
-    cases.check_refusals(case)
+    check_refusals(case)
     RESULTS["refusals"] = True
 
 

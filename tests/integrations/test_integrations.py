@@ -26,6 +26,7 @@ from saccade_lab.reference.random_weights import small_config
 from tests.compat import run as compat
 from tests.helpers import integration_cases as cases
 from tests.helpers import upstream_heads
+from tests.helpers.integration_refusals import check_refusals
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -107,7 +108,7 @@ def test_copies_hold_the_original() -> None:
 
 
 def test_refusals() -> None:
-    cases.check_refusals(n15())
+    check_refusals(n15())
 
 
 def test_threads() -> None:
