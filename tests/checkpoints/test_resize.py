@@ -19,8 +19,8 @@ from saccade import cli
 from saccade.checkpoints import convert, resize
 from saccade.checkpoints.comparison import action_changes
 from saccade.errors import CheckpointError, InputError
-from tests.checkpoints.test_convert import equal, others_of, tensors_of
 from tests.helpers import layouts
+from tests.helpers.checkpoint_files import equal, others_of, tensors_of
 
 TOKENS = "action_head.future_tokens.weight"
 N = 32
