@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ Image = npt.NDArray[np.uint8]
 DATA = Path(__file__).parents[1] / "data" / "backbone"
 TOKENIZER = DATA / "tiny_tokenizer.json"
 BLACK = np.zeros((64, 64, 3), np.uint8)
+NOISE = np.random.default_rng(0).integers(0, 256, (90, 120, 3), np.uint8)
 
 #: A frame that nothing but the last resize changes.
 AS_IT_IS = {"shortest_image_edge": None, "image_target_size": None, "crop_fraction": 1.0, "min_pixels": 1}
@@ -39,6 +41,15 @@ def stored(path: Path) -> dict[str, Array]:
         for key, (dtype, shape, data) in _saccade.read_stored(str(path)).items()
         if dtype in kinds
     }
+
+
+def checkpoint(folder: Path, fixture: str, config: dict[str, Any] | None = None) -> Path:
+    """A checkpoint that holds only a backbone."""
+    folder.mkdir(exist_ok=True)
+    shutil.copy(DATA / f"{fixture}.safetensors", folder / "model.safetensors")
+    if config is not None:
+        (folder / "config.json").write_text(json.dumps(config))
+    return folder
 
 
 def raw_frames(arrays: dict[str, Array], samples: int) -> list[list[Image]]:
