@@ -118,6 +118,7 @@ class Expert:
         self._world, self._technique = world, technique
         seen = world.situation()
         self._down = downward(seen.rotation)
+        self._hand = seen.hand
         self._held_at = seen.hand  # where it closed or opened the gripper last
         self._start(seen)
 

@@ -10,6 +10,7 @@ use crate::error::{Error, Result, ensure};
 use crate::head::action_head::ActionHead;
 use crate::head::context::Context;
 use crate::head::sample::Sampling;
+use crate::ops::in_parallel;
 use crate::processor::{Observation, Prepared, Processor};
 
 pub use load::PolicyLoadOptions;
@@ -100,10 +101,11 @@ impl Policy {
         let previous = previous.into_iter().flat_map(|previous| &previous.features);
         let previous: Vec<&BackboneFeatures> = previous.map(|features| &**features).collect();
         let features = {
-            let prepared = observations
-                .iter()
-                .map(|observation| self.processor.process(std::slice::from_ref(observation)))
-                .collect::<Result<Vec<_>>>()?;
+            let threads = self.backbone.engine().threads;
+            let prepared = in_parallel(threads, observations.len(), |index| {
+                let observation = std::slice::from_ref(&observations[index]);
+                self.processor.process_on(threads, observation)
+            })?;
             let inputs: Vec<_> = prepared.iter().map(Prepared::as_inputs).collect();
             self.backbone
                 .encode(&inputs, &previous, BackboneKeep::default())?

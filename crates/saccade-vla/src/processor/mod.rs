@@ -16,6 +16,7 @@ use saccade_vla_kernels::Isa;
 use crate::alloc::{filled, product, reserve};
 use crate::array::OwnedArray;
 use crate::error::{Error, Result, bail, ensure, problem};
+use crate::ops::in_parallel;
 use crate::release::{Pixels, Preprocessing, Version, ViewRules, choice};
 use prompt::{SpecialIds, prompt};
 use settings::{Settings, Sizes};
@@ -180,20 +181,29 @@ impl Processor {
     /// [`Error::Shape`] and [`Error::Input`] for frames that are none, for observations with different views,
     /// and for an instruction that is too long or that changes the number of image tokens; [`Error::Memory`].
     pub fn process(&self, observations: &[Observation<'_>]) -> Result<Prepared> {
+        self.process_on(1, observations)
+    }
+
+    /// As [`process`](Self::process), on up to `threads` threads.
+    pub(crate) fn process_on(&self, threads: usize, observations: &[Observation<'_>]) -> Result<Prepared> {
         let orders = self.orders(observations)?;
         let view_names = orders.first().and_then(|order| names(&observations[0], order));
-        let mut views = Vec::new();
+        let seen = || observations.iter().zip(&orders);
+        let frames: Vec<_> = seen()
+            .flat_map(|(observation, order)| order.iter().map(|&index| (index, observation.views[index])))
+            .collect();
+        let views = in_parallel(threads, frames.len(), |task| {
+            let (index, (name, frame)) = frames[task];
+            let name = name.map_or_else(|| format!("frames[{index}]"), |name| format!("frames['{name}']"));
+            view(&self.settings, self.isa, &name, frame)
+        })?;
         let mut prompts = Vec::with_capacity(observations.len());
-        for (observation, order) in observations.iter().zip(&orders) {
-            let first = views.len();
-            for &index in order {
-                let (name, frame) = observation.views[index];
-                let name =
-                    name.map_or_else(|| format!("frames[{index}]"), |name| format!("frames['{name}']"));
-                views.push(view(&self.settings, self.isa, &name, frame)?);
-            }
-            let tokens: Vec<usize> = views[first..].iter().map(|view: &View| view.tokens).collect();
+        let mut first = 0;
+        for (observation, order) in seen() {
+            let of_observation = &views[first..first + order.len()];
+            let tokens: Vec<usize> = of_observation.iter().map(|view| view.tokens).collect();
             prompts.push(self.prompt_ids(observation, &tokens)?);
+            first += order.len();
         }
         let (input_ids, attention_mask) = self.padded(&prompts)?;
         let grids: Vec<[i64; 3]> = views.iter().filter_map(|view| view.grid).collect();
