@@ -56,7 +56,7 @@ def demonstration(seed: int, steps: int = 22, frame_stride: int = STRIDE) -> Dem
 def write_recording(folder: Path, episodes: int = 2, frame_stride: int = STRIDE) -> Path:
     """Writes a recording of two tasks."""
     for task, said in enumerate(SAID):
-        settings = LiberoRecording("libero_object", task, said, SIZE, frame_stride)
+        settings = LiberoRecording("libero_object", task, said, 2, SIZE, frame_stride)
         (folder / settings.name).mkdir(parents=True)
         write_json(folder / settings.name / "recording.json", settings.to_dict())
         for episode in range(episodes):

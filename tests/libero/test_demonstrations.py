@@ -5,6 +5,8 @@ from __future__ import annotations
 import io
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,7 +16,7 @@ from saccade.cli import main
 from saccade_lab.libero import demos
 from saccade_lab.libero.checkpoint import ACTION_GROUPS, CAMERAS, STATE_GROUPS
 from saccade_lab.libero.environment import LiberoEnvironment
-from saccade_lab.libero.expert import Expert
+from saccade_lab.libero.expert import OPEN, Expert
 from saccade_lab.libero.recording import read_recordings
 from saccade_lab.libero.scene import Scene
 from saccade_lab.parallel import Workers
@@ -23,6 +25,7 @@ from saccade_lab.sim.demos import load
 from saccade_lab.sim.tasks import DEMONSTRATION_SEEDS
 
 SEED = DEMONSTRATION_SEEDS.start
+CARRIED_NOTHING = SEED + 7  # a seed of task 6 whose miss ends while the empty hand is carried
 SMALL = demos.recording("libero_object", 6, image_size=32, frame_stride=30)
 
 #: Positions of the object and the basket in the first frame of the first demonstration of that task.
@@ -82,19 +85,41 @@ def test_a_recording_shows_what_happened(tmp_path: Path) -> None:
     environment.close()
 
 
-def test_a_third_begins_after_a_grasp_that_missed() -> None:
-    missed = SEED + 6  # the first such seed of this task
+def test_a_demonstration_after_a_miss_begins_with_a_hand_that_holds_nothing() -> None:
     environment = LiberoEnvironment("libero_object", 6, image_size=32, settle_steps=0, official_states=False)
-    at_rest = demos.start(environment, SMALL, missed).situation()
-    episode = demos.record_episode(environment, SMALL, missed)
+    scene = demos.start(environment, SMALL, CARRIED_NOTHING)
+    at_rest = scene.situation()
+    episode = demos.record_episode(environment, SMALL, CARRIED_NOTHING)
     assert episode is not None
-    usual = demos.record_episode(environment, SMALL, SEED)
+    assert environment.success
     environment.close()
-    assert usual is not None
-    assert np.linalg.norm(usual.proprio[0, :3] - at_rest.hand) < 0.01
-    begun_at = episode.proprio[0, :3]
-    assert np.linalg.norm(begun_at - at_rest.hand) > 0.03  # metres: the hand has moved before the recording
-    assert np.linalg.norm(episode.targets[0, :3] - at_rest.body) < 0.1  # and has not carried the object away
+    target, hand, fingers = episode.targets[0, :3], episode.proprio[0, :3], episode.proprio[0, 6:8]
+    assert np.abs(fingers).max() < 0.005  # metres: closed on nothing
+    assert hand[2] > at_rest.target[:, 2].max() + 0.03  # and carried
+    np.testing.assert_allclose(target, at_rest.body, atol=0.05)  # while the object stayed where it was
+    assert episode.actions[0, 6] == OPEN
+
+
+def test_a_third_of_the_demonstrations_begins_after_a_miss(monkeypatch: pytest.MonkeyPatch) -> None:
+    tried: list[int] = []
+
+    def no_miss(scene: Any, technique: Any, advance: Any, rng: Any) -> bool:
+        tried.append(1)
+        return False  # so that nothing is recorded
+
+    environment = SimpleNamespace(observe=None, advance=None)
+    monkeypatch.setattr(demos, "start", lambda environment, settings, seed: None)
+    monkeypatch.setattr(demos, "Expert", lambda scene, technique: SimpleNamespace(action=None))
+    monkeypatch.setattr(demos, "miss", no_miss)
+    monkeypatch.setattr(demos.demos, "demonstrated", lambda *given, **named: None)
+    spatial = demos.recording("libero_spatial", 0, image_size=32, frame_stride=30)
+    for seed in range(SEED, SEED + 600):
+        demos.record_episode(environment, SMALL, seed)  # type: ignore[arg-type]
+    assert 0.28 < len(tried) / 600 < 0.39
+    tried.clear()
+    for seed in range(SEED, SEED + 100):
+        demos.record_episode(environment, spatial, seed)  # type: ignore[arg-type]
+    assert not tried
 
 
 def test_starts_are_wider_than_the_official_ones() -> None:

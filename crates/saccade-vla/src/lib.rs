@@ -33,6 +33,8 @@ mod inspect;
 mod nn;
 mod ops;
 #[cfg(feature = "processor")]
+mod parallel;
+#[cfg(feature = "processor")]
 mod policy;
 mod precision;
 #[cfg(feature = "processor")]

@@ -14,7 +14,11 @@ const SIDE: usize = 68;
 const SHAPE: [usize; 3] = [SIDE, SIDE, 3];
 
 fn demo() -> Policy {
-    let num_threads = Some(1);
+    demo_on(1)
+}
+
+fn demo_on(threads: usize) -> Policy {
+    let num_threads = Some(threads);
     let backbone = BackboneLoadOptions {
         num_threads,
         ..BackboneLoadOptions::default()
@@ -186,6 +190,45 @@ fn what_does_not_fit_is_an_error() {
     }
     let missing = Policy::load(Path::new("no-such-checkpoint"), &PolicyLoadOptions::default());
     assert!(missing.err().unwrap().to_string().contains("no-such-checkpoint"));
+}
+
+#[test]
+fn frames_that_several_threads_prepare_have_the_bits_of_one() {
+    let (alone, together) = (demo(), demo_on(3));
+    let pictures: Vec<_> = (0..9).map(picture).collect();
+    let seen = [
+        observation(&pictures[..3], "push"),
+        observation(&pictures[3..4], "open the drawer"),
+        observation(&pictures[4..], "reach"),
+    ];
+    let expected = alone.encode(&seen, None).unwrap();
+    let found = together.encode(&seen, None).unwrap();
+    assert_eq!(actions(&together, &found), actions(&alone, &expected));
+    assert!(found.context.vl_embs() == expected.context.vl_embs());
+}
+
+#[test]
+fn a_frame_that_is_none_is_named_by_its_place() {
+    let pictures = [1, 2, 3].map(picture);
+    let empty: [u8; 0] = [];
+    for threads in [1, 3] {
+        let policy = demo_on(threads);
+        let mut wrong = observation(&pictures, "push");
+        wrong.views[1] = (None, Frame::U8(Array::new(&empty, &[0, SIDE, 3]).unwrap()));
+        wrong.views[2] = (
+            Some("wrist"),
+            Frame::U8(Array::new(&pictures[2], &[3 * SIDE * SIDE]).unwrap()),
+        );
+        let error = policy.encode(&[observation(&pictures, "push"), wrong.clone()], None);
+        let error = error.err().unwrap().to_string();
+        assert!(error.starts_with("frames[1]: expected an RGB frame"), "{error}");
+        wrong.views.remove(1);
+        let error = policy.encode(&[wrong], None).err().unwrap().to_string();
+        assert!(
+            error.starts_with("frames['wrist']: expected an RGB frame"),
+            "{error}"
+        );
+    }
 }
 
 #[test]

@@ -97,8 +97,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--dtype",
         choices=("float32", "bfloat16"),
-        help="of products while training on a CPU; bfloat16 saves a third of the time where the CPU "
-        "multiplies it (default: float32)",
+        help="what most is computed in, on a CPU; bfloat16 is faster where the CPU multiplies it (default: "
+        "float32)",
     )
     parser.add_argument(
         "--version",

@@ -1,7 +1,8 @@
 """Demonstrations of LIBERO: the scripted expert, recorded with both cameras of a policy.
 
 They start from layouts that LIBERO's reset draws, spread further by ``placements``, never from an official
-initial state. Episodes, files and their continuation are as in ``saccade_lab.sim.demos``.
+initial state, some of them after a grasp that missed. Episodes, files and their continuation are as in
+``saccade_lab.sim.demos``.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from saccade.errors import InputError
 from saccade_lab.libero.checkpoint import ACTION_GROUPS, CAMERAS, CONTROL_HZ, STATE_GROUPS, policy_actions
 from saccade_lab.libero.expert import INTO_BASKET, ONTO_PLATE, Expert, Technique
 from saccade_lab.libero.grasps import Points
-from saccade_lab.libero.misses import miss
+from saccade_lab.libero.misses import MISS_SHARE, miss
 from saccade_lab.libero.placements import TRADE_SHARE, wider
 from saccade_lab.libero.recording import LiberoRecording
 from saccade_lab.libero.scene import Scene
@@ -40,13 +41,16 @@ class SuiteExpert:
         technique: How the object is taken and let go.
         trade_share: Share of the demonstrations in which objects trade places. 0 if instructions say where an
             object stands.
-        miss_share: Share of the demonstrations that begin after a grasp that missed.
+        miss_share: Share of the demonstrations that begin after a grasp that missed; see ``misses``.
+        version: Raised whenever one of what decides an episode changes: the expert, its grasps and misses,
+            placements, bursts, numbers of steps. So a recording does not go on with other episodes.
         radius: Metres from the middle of an object that others stay away, by its ground plan ``(n, 2)``.
     """
 
     technique: Technique
     trade_share: float
     miss_share: float
+    version: int
     radius: Callable[[Points], float]
 
 
@@ -61,15 +65,14 @@ def largest_distance(plan: Points) -> float:
     return float(np.linalg.norm(plan - middle, axis=1).max())
 
 
-MISS_SHARE = 1 / 3
 EXPERTS: Mapping[str, SuiteExpert] = {
-    "libero_object": SuiteExpert(INTO_BASKET, TRADE_SHARE, MISS_SHARE, half_diagonal),
+    "libero_object": SuiteExpert(INTO_BASKET, TRADE_SHARE, MISS_SHARE, 2, half_diagonal),
     # Its objects are round and near to each other: with half a diagonal there is no room to move them.
-    "libero_spatial": SuiteExpert(ONTO_PLATE, 0.0, 0.0, largest_distance),
+    "libero_spatial": SuiteExpert(ONTO_PLATE, 0.0, 0.0, 1, largest_distance),
 }
 DEFAULT_COUNT = 40
 IMAGE_SIZE, FRAME_STRIDE = 256, 5
-MAX_STEPS = 280  # as in evaluations; the expert needs 80 to 210
+MAX_STEPS = 280  # as in evaluations; without a miss the expert needs 80 to 210
 SETTLE_STEPS = 10
 ROBOT = "libero_panda"
 #: Milder than Meta-World's, because a step moves the hand further: up to 5 cm instead of 1.
@@ -84,7 +87,8 @@ def recording(suite: str, task: int, image_size: int, frame_stride: int) -> Libe
     """
     if suite not in EXPERTS:
         raise InputError(f"suite: given {suite!r}, expected one with an expert: {', '.join(EXPERTS)}")
-    return LiberoRecording(suite, task, find_task(suite, task).instruction, image_size, frame_stride)
+    instruction, version = find_task(suite, task).instruction, EXPERTS[suite].version
+    return LiberoRecording(suite, task, instruction, version, image_size, frame_stride)
 
 
 def all_tasks(suite: str) -> tuple[int, ...]:
@@ -135,12 +139,15 @@ def start(environment: LiberoEnvironment, settings: LiberoRecording, seed: int) 
 def record_episode(
     environment: LiberoEnvironment, settings: LiberoRecording, seed: int
 ) -> demos.Demonstration | None:
-    """Records one episode of the expert; None if it did not succeed. For ``environment`` see ``start``."""
+    """Records one episode of the expert, from its start or after a miss; None if it did not succeed.
+
+    For ``environment`` see ``start``. Control steps of the miss are not recorded.
+    """
     scene = start(environment, settings, seed)
-    technique, miss_share = EXPERTS[settings.suite].technique, EXPERTS[settings.suite].miss_share
-    expert, rng = Expert(scene, technique), np.random.default_rng((settings.task, seed, 2))
-    if rng.random() < miss_share:
-        if not miss(scene, technique, environment.advance, rng):
+    of_suite = EXPERTS[settings.suite]
+    expert, rng = Expert(scene, of_suite.technique), np.random.default_rng((settings.task, seed, 2))
+    if rng.random() < of_suite.miss_share:
+        if not miss(scene, of_suite.technique, environment.advance, rng):
             return None
         expert.begin_again()
 

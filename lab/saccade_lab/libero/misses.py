@@ -1,7 +1,7 @@
 """Grasps that miss, for demonstrations that begin after one; NumPy only.
 
-A policy that was trained on demonstrations without misses has never seen a closed hand that is empty: when it
-misses, it carries nothing to the goal, and stays there.
+In demonstrations without them a closed hand always holds the object. A policy that was trained on these, and
+misses, carries nothing to the goal.
 """
 
 from __future__ import annotations
@@ -12,37 +12,40 @@ from dataclasses import replace
 import numpy as np
 
 from saccade._internal.arrays import Float32Array
-from saccade_lab.libero.expert import Expert, Situation, Technique, Vector, World
+from saccade_lab.libero.expert import CLOSE, Expert, Situation, Technique, Vector, World
 from saccade_lab.libero.grasps import Points
 from saccade_lab.sim.scenarios import StepOutcome
 
-DISTANCES = (0.02, 0.07)  # metres from the object to where the hand takes hold, in the plane
+MISS_SHARE = 1 / 3  # of the demonstrations
+DISTANCES = (0.03, 0.07)  # metres from the object to where the hand takes hold, in the plane
 HEIGHTS = (0.0, 0.03)  # metres, above
-STEPS = (20, 130)  # control steps of the miss; the expert needs 80 to 210 for the whole task
-HOLDING = ("lift", "carry", "lower")  # phases of the expert in which the object should be in the hand
+STEPS = (20, 131)  # control steps of a miss, the second excluded; a whole task without one takes 80 to 210
+UNDECIDED = ("close", "lift")  # phases in which the object may be between the fingers, and still on the floor
+LIFTED = 0.01  # metres that the object has risen, if it was grasped
 
 
 class Imagined:
-    """A world whose target seems to be elsewhere, and to move with the hand once it was taken.
+    """A world whose target seems to be elsewhere, and to be in the hand once that has closed.
 
     Args:
         world: The world as it is.
         away: ``(3,)`` metres from the target to where it seems to be.
-
-    Attributes:
-        held: Whether the target seems to be in the hand.
     """
 
     def __init__(self, world: World, away: Vector) -> None:
         seen = world.situation()
         self._world = world
         self._hand, self._body, self._target = seen.hand, seen.body + away, seen.target + away
-        self.held = False
+        self._closed = False
+
+    def command(self, grip: float) -> None:
+        """Says what the gripper is told: ``OPEN`` or ``CLOSE``."""
+        self._closed = grip == CLOSE
 
     def situation(self) -> Situation:
         """See ``World``."""
         seen = self._world.situation()
-        if self.held:
+        if self._closed:
             moved = seen.hand - self._hand
             self._body, self._target = self._body + moved, self._target + moved
         self._hand = seen.hand
@@ -63,27 +66,31 @@ def miss(
     advance: Callable[[Float32Array], StepOutcome],
     rng: np.random.Generator,
 ) -> bool:
-    """Lets an expert that misses act for a random number of control steps.
+    """Executes a grasp beside the object, and what would follow, for a random number of steps.
 
-    They end anywhere between the way to the object and after nothing was put down. Whoever goes on from
-    there finds the hand open or closed at a place where demonstrations from the start never have it, and
-    sometimes the object pushed or toppled.
+    It ends on the way to the object, while an empty hand is carried to the goal, or after that has opened.
+    The object may have been pushed or toppled.
 
     Args:
-        world: The simulation that it acts in.
-        technique: How it would take the object.
+        world: The simulation.
+        technique: How the object would be taken.
         advance: Executes an action.
-        rng: Draws where it takes hold, and for how long it acts.
+        rng: Draws where the hand closes, and the number of steps.
 
     Returns:
-        Whether it missed. By accident the task may be done, where a small distance was drawn.
+        Whether the object was missed. Otherwise it was grasped after all, and no demonstration should begin
+        here: its first action would be to let go.
     """
     angle, distance = rng.uniform(-np.pi, np.pi), rng.uniform(*DISTANCES)
     away = np.array([distance * np.cos(angle), distance * np.sin(angle), rng.uniform(*HEIGHTS)])
+    lowest = world.situation().target[:, 2].min()
     imagined = Imagined(world, away)
     expert = Expert(imagined, technique)
-    for _ in range(rng.integers(*STEPS)):
-        if advance(expert.action()).success:
+    steps = rng.integers(*STEPS)
+    while steps > 0 or expert.phase in UNDECIDED:
+        action = expert.action()
+        if advance(action).success:
             return False
-        imagined.held = expert.phase in HOLDING
-    return True
+        imagined.command(float(action[-1]))
+        steps -= 1
+    return bool(world.situation().target[:, 2].min() < lowest + LIFTED)

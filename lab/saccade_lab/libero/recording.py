@@ -18,9 +18,6 @@ from saccade_lab.training import dataset
 from saccade_lab.training.dataset import Samples
 
 SETTINGS_FILE = "recording.json"
-#: Version of what else decides an episode: the expert, its grasps and misses, placements, bursts, numbers of
-#: steps. Whoever changes one of them raises it, so that a recording does not go on with other episodes.
-EXPERT = 2
 
 
 @dataclass(frozen=True)
@@ -31,17 +28,17 @@ class LiberoRecording:
         suite: Its suite.
         task: Its number in the suite.
         instruction: What a policy is told.
+        expert: The version of the expert that recorded it; see ``demos.SuiteExpert``.
         image_size: Pixels along each side of a frame.
         frame_stride: Control steps between recorded observations.
-        expert: The ``EXPERT`` that recorded it.
     """
 
     suite: str
     task: int
     instruction: str
+    expert: int
     image_size: int = 256
     frame_stride: int = 5
-    expert: int = EXPERT
 
     @property
     def name(self) -> str:

@@ -13,7 +13,7 @@ from saccade_lab.libero.recording import describe, load_samples, read_recordings
 from saccade_lab.libero.sizes import libero_config
 from saccade_lab.sim.allocator import keep_freed_memory
 from saccade_lab.training.settings import TrainingSettings
-from saccade_lab.training.train import Progress, fit, new_run
+from saccade_lab.training.train import Progress, check_device, fit, new_run
 
 
 def train(
@@ -38,8 +38,9 @@ def train(
 
     Raises:
         FileNotFoundError: There are no demonstrations.
-        InputError: Demonstrations or settings that do not fit, or ``out`` contains a run with others.
+        InputError: Demonstrations, settings or the device do not fit, or ``out`` contains a run with others.
     """
+    check_device(settings, device)
     keep_freed_memory()
     recordings = read_recordings(demonstrations)
     config = libero_config(settings, [task.instruction for task in recordings], recordings[0].image_size)

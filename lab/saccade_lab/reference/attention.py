@@ -52,9 +52,7 @@ class Attention(nn.Module):
         q = self.split_heads(self.to_q(x))  # (B, heads, Q, head_dim)
         k = self.split_heads(self.to_k(context))  # (B, heads, S, head_dim)
         v = self.split_heads(self.to_v(context))  # (B, heads, S, head_dim)
-        # In bfloat16, torch's own kernel takes longer than what it replaces (torch 2.13, CPU).
-        written_out = return_weights or torch.is_autocast_enabled(q.device.type)
-        if stop_gradient is None and not written_out:
+        if stop_gradient is None and not return_weights:
             weights, values = None, fused_attention(q, k, v, logit_bias)
         else:
             weights = attention_weights(q, k, logit_bias, stop_gradient)  # (B, heads, Q, S)
@@ -94,6 +92,9 @@ def attention_weights(
 def fused_attention(q: Tensor, k: Tensor, v: Tensor, logit_bias: Tensor | None) -> Tensor:
     """The sums of ``attention_weights`` and ``attention_values`` by torch's own kernel: faster in training.
 
+    Under autocast on a CPU it computes in float32 all the same: there the kernel takes 2 to 4 times as long
+    in bfloat16 (torch 2.13, Zen 4, 32 x 4 heads of 17 to 92 rows).
+
     Args:
         q: ``(B, heads, Q, head_dim)``.
         k, v: ``(B, heads, S, head_dim)``.
@@ -102,6 +103,9 @@ def fused_attention(q: Tensor, k: Tensor, v: Tensor, logit_bias: Tensor | None) 
     Returns:
         ``(B, heads, Q, head_dim)``.
     """
+    if q.dtype == torch.bfloat16 and q.device.type == "cpu" and torch.is_autocast_enabled("cpu"):
+        with torch.autocast("cpu", enabled=False):
+            return fused_attention(q.float(), k.float(), v.float(), logit_bias)
     if logit_bias is None:
         return F.scaled_dot_product_attention(q, k, v)
     bias, nothing_left = split_bias(logit_bias)

@@ -50,10 +50,7 @@ class ActionHead(VelocityNetwork):
     Args:
         config: Sizes and switches.
         time_distribution: The distribution of ``sample_time``.
-        unused: Names of parameters that only the released training uses (``task_log_sigma.NAME``,
-            ``mask_token``). They are kept, so that a checkpoint stays complete.
-        has_state_dropout: Whether there is ``dropout_prob_by_embodiment``, ``(num_embodiments,)``, zeros at
-            first. The states of embodiments with an entry above 0.999 are set to zero.
+        unused, has_state_dropout: As in ``VelocityNetwork``.
 
     Example:
         >>> from saccade_lab.reference import random_weights

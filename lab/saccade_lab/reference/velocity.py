@@ -41,7 +41,10 @@ class VelocityNetwork(nn.Module):
 
     Args:
         config: Sizes and switches.
-        unused, has_state_dropout: As in ``ActionHead``.
+        unused: Names of parameters that only the released training uses (``task_log_sigma.NAME``,
+            ``mask_token``). They are kept, so that a checkpoint stays complete.
+        has_state_dropout: Whether there is ``dropout_prob_by_embodiment``, ``(num_embodiments,)``, zeros at
+            first. The states of embodiments with an entry above 0.999 are set to zero.
     """
 
     mask_token: nn.Parameter  # if it is among `unused`
@@ -78,7 +81,7 @@ class VelocityNetwork(nn.Module):
 
     @property
     def dtype(self) -> torch.dtype:
-        """The dtype of the parameters, in which everything is computed."""
+        """The dtype of the parameters, in which everything is computed without autocast."""
         return self.model.proj_out_2.weight.dtype
 
     @property
@@ -173,7 +176,7 @@ class VelocityNetwork(nn.Module):
         actions: Tensor | np.ndarray,
         timestep: int | Tensor | np.ndarray,
     ) -> Tensor:
-        """One velocity evaluation of a run. Arguments and result are as in ``velocity``."""
+        """One velocity evaluation of a run. Arguments, result and errors are as in ``velocity``."""
         config, horizon = self.config, self.config.action_horizon
         actions, state = self.as_input(actions), self.as_input(state)
         batch = vl_embs.shape[0]

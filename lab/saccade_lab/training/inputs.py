@@ -55,7 +55,9 @@ def prepared_inputs(
     """
     # As a tensor: a GPU multiplies by the inverse of a number, which rounds otherwise.
     centre = torch.full((), float(PIXEL_CENTRE), device=images.device)
-    views, core = images.flatten(0, 1).float().sub_(centre).div_(centre), backbone.core
+    # In place, and before patches repeat each frame: it is a large part of a training step.
+    views = images.flatten(0, 1).to(torch.float32, copy=True).sub_(centre).div_(centre)
+    core = backbone.core
     if isinstance(core, Eagle):
         shown, grids = views, core.grids(views)
     else:

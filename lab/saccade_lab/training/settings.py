@@ -87,8 +87,9 @@ class TrainingSettings:
         execute_steps: Actions of a chunk that are executed before the next observation.
         num_steps: Euler steps at run time.
         patch_size: Pixels along each side of the patch behind an image token, an even number.
-        dtype: ``"float32"``, or ``"bfloat16"`` for products in bfloat16, by torch's autocast. Weights and the
-            optimiser's state stay in float32.
+        dtype: ``"float32"``, or ``"bfloat16"`` for training under torch's autocast, on a CPU: products and
+            most of what is between them are computed in bfloat16. Weights, their gradients and averages, the
+            attention of the head and losses stay in float32, and so does everything of held-out frames.
         version: ``"n1.5"`` or ``"n1.7"``, of which only policies of LIBERO can be.
         view_size: Pixels along each side of a frame as the tower of a LIBERO policy sees it, a multiple of
             ``patch_size``; 0 for policies of Meta-World, which see the recorded size.

@@ -129,16 +129,20 @@ def with_statistics(config: PolicyConfig, samples: Samples) -> PolicyConfig:
     return replace(config, statistics={kind: statistics_of(values) for kind, values in recorded.items()})
 
 
-def new_run(
-    settings: TrainingSettings, config: PolicyFiles, demonstrations: dict[str, Any], device: str = "cpu"
-) -> Run:
-    """A run before its first step; for ``demonstrations`` see ``dataset.describe``.
+def check_device(settings: TrainingSettings, device: str) -> None:
+    """Refuses bfloat16 on another device than a CPU, where it was never tried.
 
     Raises:
-        InputError: bfloat16 on another device than a CPU, which was never tried.
+        InputError: That is what is asked for.
     """
     if settings.dtype != "float32" and torch.device(device).type != "cpu":
         raise InputError(f"dtype: given {settings.dtype!r} with device {device!r}, expected 'float32'")
+
+
+def new_run(
+    settings: TrainingSettings, config: PolicyFiles, demonstrations: dict[str, Any], device: str = "cpu"
+) -> Run:
+    """A run before its first step; for ``demonstrations`` see ``dataset.describe``."""
     learner = new_learner(settings, config).to(device)
     matrices = [parameter for parameter in learner.parameters() if parameter.ndim >= 2]
     others = [parameter for parameter in learner.parameters() if parameter.ndim < 2]
@@ -334,8 +338,10 @@ def train(
 
     Raises:
         FileNotFoundError: There are no demonstrations, or no policy to start from.
-        InputError: Demonstrations with different settings, or ``out`` contains a run with other settings.
+        InputError: Demonstrations with different settings, ``out`` contains a run with other settings, or the
+            device does not have the dtype.
     """
+    check_device(settings, device)
     if settings.only == "head" and start is None:
         raise InputError("start: given none, expected a policy, since only the head is trained")
     keep_freed_memory()

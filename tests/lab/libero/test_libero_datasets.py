@@ -14,7 +14,7 @@ from tests.helpers.libero_cases import SAID, SIZE, demonstration, write_recordin
 
 def test_a_data_set_says_where_another_action_was_executed(tmp_path: Path) -> None:
     folder = write_recording(tmp_path / "demos", frame_stride=1)
-    tasks = [LiberoRecording("libero_object", task, said, SIZE, 1) for task, said in enumerate(SAID)]
+    tasks = [LiberoRecording("libero_object", task, said, 2, SIZE, 1) for task, said in enumerate(SAID)]
     demos.export(folder, tasks, 1, tmp_path / "data")
     data = saccade.datasets.open(tmp_path / "data")
     assert len(data) == len(SAID)

@@ -24,7 +24,7 @@ from saccade_lab.libero.checkpoint import (
     policy_actions,
 )
 from saccade_lab.libero.policy import LiberoPolicy
-from saccade_lab.libero.recording import EXPERT, describe, is_recording, load_samples, read_recordings
+from saccade_lab.libero.recording import describe, is_recording, load_samples, read_recordings
 from saccade_lab.libero.sizes import libero_config
 from saccade_lab.reference import ActionHead, Backbone
 from saccade_lab.sim import demos as sim_demos
@@ -185,6 +185,18 @@ def test_the_defaults_have_at_most_six_million_parameters() -> None:
 
 
 @pytest.mark.parametrize("version", VERSIONS)
+def test_training_in_bfloat16_is_near_that_in_float32(version: str, recording: Path, tmp_path: Path) -> None:
+    losses = {}
+    for dtype in ("float32", "bfloat16"):
+        progress: list[Progress] = []
+        settings = dataclasses.replace(tiny(version), dtype=dtype)
+        training.train(recording, tmp_path / dtype, settings, progress.append)
+        losses[dtype] = [one.loss for one in progress]
+    assert losses["bfloat16"] != losses["float32"]
+    np.testing.assert_allclose(losses["bfloat16"], losses["float32"], rtol=0.03)
+
+
+@pytest.mark.parametrize("version", VERSIONS)
 def test_a_padded_prompt_changes_nothing(version: str, recording: Path) -> None:
     """In a batch, prompts are padded to the longest; each sample's loss is as it is alone."""
     config = libero_config(tiny(version), SAID, SIZE)
@@ -274,7 +286,7 @@ def test_recordings_that_do_not_fit_are_refused(recording: Path, tmp_path: Path)
         load_samples(other, tasks, 16, processor)
     path = other / "libero_object-1" / "recording.json"
     values = json.loads(path.read_text())
-    for changed in ({"frame_stride": 9}, {"expert": EXPERT + 1}):
+    for changed in ({"frame_stride": 9}, {"expert": values["expert"] + 1}):
         path.write_text(json.dumps({**values, **changed}))
         with pytest.raises(InputError, match="different settings"):
             read_recordings(other)

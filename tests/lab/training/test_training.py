@@ -60,7 +60,7 @@ def test_training_resumes_to_the_same_weights(
         assert torch.equal(tensor, ends[1]["learner"][name]), name
 
 
-def test_bfloat16_narrows_products_only(recording: Path) -> None:
+def test_bfloat16_is_near_float32_and_keeps_weights_wide(recording: Path) -> None:
     torch.set_num_threads(1)
     found = {}
     for dtype in ("float32", "bfloat16"):
@@ -73,11 +73,11 @@ def test_bfloat16_narrows_products_only(recording: Path) -> None:
     np.testing.assert_allclose(found["bfloat16"], found["float32"], rtol=0.02)
 
 
-def test_bfloat16_on_another_device_than_a_cpu_is_refused(recording: Path) -> None:
+def test_bfloat16_on_another_device_than_a_cpu_is_refused(recording: Path, tmp_path: Path) -> None:
     settings = dataclasses.replace(TINY, dtype="bfloat16")
-    run, _ = make_batches(recording, TINY, with_later=False)
     with pytest.raises(InputError, match="dtype: given 'bfloat16' with device 'cuda', expected 'float32'"):
-        train.new_run(settings, run.config, run.demonstrations, "cuda")
+        train.train(recording, tmp_path, settings, ignore, device="cuda")
+    assert not list(tmp_path.iterdir())
 
 
 def test_the_followed_tensors_stay_those_of_the_learner(recording: Path, tmp_path: Path) -> None:

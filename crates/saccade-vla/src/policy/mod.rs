@@ -10,7 +10,6 @@ use crate::error::{Error, Result, ensure};
 use crate::head::action_head::ActionHead;
 use crate::head::context::Context;
 use crate::head::sample::Sampling;
-use crate::ops::in_parallel;
 use crate::processor::{Observation, Prepared, Processor};
 
 pub use load::PolicyLoadOptions;
@@ -84,7 +83,7 @@ impl Policy {
     }
 
     /// Encodes observations, which need not agree in their views or in the length of their prompts. Each has the
-    /// bits that it has alone.
+    /// bits that it has alone. Frames are prepared on the threads of the backbone.
     ///
     /// From `previous`, a context whose features this backbone made, the tokens of views with the same frames and
     /// the unchanged beginning of a prompt are taken. The bits are the same without it.
@@ -101,11 +100,9 @@ impl Policy {
         let previous = previous.into_iter().flat_map(|previous| &previous.features);
         let previous: Vec<&BackboneFeatures> = previous.map(|features| &**features).collect();
         let features = {
-            let threads = self.backbone.engine().threads;
-            let prepared = in_parallel(threads, observations.len(), |index| {
-                let observation = std::slice::from_ref(&observations[index]);
-                self.processor.process_on(threads, observation)
-            })?;
+            let prepared = self
+                .processor
+                .process_each(self.backbone.engine().threads, observations)?;
             let inputs: Vec<_> = prepared.iter().map(Prepared::as_inputs).collect();
             self.backbone
                 .encode(&inputs, &previous, BackboneKeep::default())?

@@ -16,7 +16,7 @@ use saccade_vla_kernels::Isa;
 use crate::alloc::{filled, product, reserve};
 use crate::array::OwnedArray;
 use crate::error::{Error, Result, bail, ensure, problem};
-use crate::ops::in_parallel;
+use crate::parallel::in_parallel;
 use crate::release::{Pixels, Preprocessing, Version, ViewRules, choice};
 use prompt::{SpecialIds, prompt};
 use settings::{Settings, Sizes};
@@ -181,29 +181,67 @@ impl Processor {
     /// [`Error::Shape`] and [`Error::Input`] for frames that are none, for observations with different views,
     /// and for an instruction that is too long or that changes the number of image tokens; [`Error::Memory`].
     pub fn process(&self, observations: &[Observation<'_>]) -> Result<Prepared> {
-        self.process_on(1, observations)
+        let orders = self.orders(observations)?;
+        let views = self.views(1, observations, &orders)?;
+        self.prepared(observations, &orders, views)
     }
 
-    /// As [`process`](Self::process), on up to `threads` threads.
-    pub(crate) fn process_on(&self, threads: usize, observations: &[Observation<'_>]) -> Result<Prepared> {
-        let orders = self.orders(observations)?;
-        let view_names = orders.first().and_then(|order| names(&observations[0], order));
-        let seen = || observations.iter().zip(&orders);
-        let frames: Vec<_> = seen()
+    /// The inputs of each observation, a batch of one each. Their frames are prepared on up to `threads` threads.
+    ///
+    /// # Errors
+    /// Those of [`process`](Self::process), of frames before those of instructions.
+    pub(crate) fn process_each(
+        &self,
+        threads: usize,
+        observations: &[Observation<'_>],
+    ) -> Result<Vec<Prepared>> {
+        let alone = || observations.iter().map(std::slice::from_ref);
+        let orders = alone().map(|one| self.orders(one)).collect::<Result<Vec<_>>>()?;
+        let orders = orders.concat();
+        let mut views = self.views(threads, observations, &orders)?.into_iter();
+        alone()
+            .zip(&orders)
+            .map(|(one, order)| {
+                let views = views.by_ref().take(order.len()).collect();
+                self.prepared(one, std::slice::from_ref(order), views)
+            })
+            .collect()
+    }
+
+    /// The views of all observations in their orders, one observation after the other.
+    fn views(
+        &self,
+        threads: usize,
+        observations: &[Observation<'_>],
+        orders: &[Vec<usize>],
+    ) -> Result<Vec<View>> {
+        let frames: Vec<_> = observations
+            .iter()
+            .zip(orders)
             .flat_map(|(observation, order)| order.iter().map(|&index| (index, observation.views[index])))
             .collect();
-        let views = in_parallel(threads, frames.len(), |task| {
+        in_parallel(threads, frames.len(), |task| {
             let (index, (name, frame)) = frames[task];
             let name = name.map_or_else(|| format!("frames[{index}]"), |name| format!("frames['{name}']"));
             view(&self.settings, self.isa, &name, frame)
-        })?;
+        })
+    }
+
+    /// A batch of observations whose `views` stand one observation after the other, in their orders.
+    fn prepared(
+        &self,
+        observations: &[Observation<'_>],
+        orders: &[Vec<usize>],
+        views: Vec<View>,
+    ) -> Result<Prepared> {
+        let view_names = orders.first().and_then(|order| names(&observations[0], order));
         let mut prompts = Vec::with_capacity(observations.len());
-        let mut first = 0;
-        for (observation, order) in seen() {
-            let of_observation = &views[first..first + order.len()];
-            let tokens: Vec<usize> = of_observation.iter().map(|view| view.tokens).collect();
+        let mut rest = &views[..];
+        for (observation, order) in observations.iter().zip(orders) {
+            let (seen, others) = rest.split_at(order.len());
+            let tokens: Vec<usize> = seen.iter().map(|view| view.tokens).collect();
             prompts.push(self.prompt_ids(observation, &tokens)?);
-            first += order.len();
+            rest = others;
         }
         let (input_ids, attention_mask) = self.padded(&prompts)?;
         let grids: Vec<[i64; 3]> = views.iter().filter_map(|view| view.grid).collect();

@@ -329,7 +329,7 @@ def with_image_tokens(x: Tensor, places: Tensor, tokens: Tensor) -> Tensor:
         places: See ``PreparedInputs.image_places``.
         tokens: ``(N, width)``.
     """
-    return x.flatten(0, 1).index_copy(0, places, tokens.to(x.dtype)).view_as(x)
+    return x.flatten(0, 1).index_copy(0, places, tokens).view_as(x)
 
 
 def added_after(stacked: list[Tensor], places: Tensor) -> Callable[[int, Tensor], Tensor]:
