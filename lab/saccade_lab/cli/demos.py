@@ -29,7 +29,8 @@ saccade.datasets.open read. If the command is interrupted, run it again: with --
 continues where it stopped. The files are the same with any number of processes and machines.
 
 --env libero_object or libero_spatial records the tasks 0 to 9 of a suite of LIBERO instead, each
-from wider placements than those that LIBERO evaluates on (extra libero).
+from wider placements than those that LIBERO evaluates on, a third of libero_object's after a grasp
+that missed (extra libero).
 
 examples:
   saccade demos --out out/demos                               the data of the bundled policy
