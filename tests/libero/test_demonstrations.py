@@ -20,6 +20,7 @@ from saccade_lab.libero.expert import OPEN, Expert
 from saccade_lab.libero.recording import read_recordings
 from saccade_lab.libero.scene import Scene
 from saccade_lab.parallel import Workers
+from saccade_lab.sim import demos as sim_demos
 from saccade_lab.sim import environment_cache
 from saccade_lab.sim.demos import load
 from saccade_lab.sim.tasks import DEMONSTRATION_SEEDS
@@ -111,7 +112,7 @@ def test_a_third_of_the_demonstrations_begins_after_a_miss(monkeypatch: pytest.M
     monkeypatch.setattr(demos, "start", lambda environment, settings, seed: None)
     monkeypatch.setattr(demos, "Expert", lambda scene, technique: SimpleNamespace(action=None))
     monkeypatch.setattr(demos, "miss", no_miss)
-    monkeypatch.setattr(demos.demos, "demonstrated", lambda *given, **named: None)
+    monkeypatch.setattr(sim_demos, "demonstrated", lambda *given, **named: None)
     spatial = demos.recording("libero_spatial", 0, image_size=32, frame_stride=30)
     for seed in range(SEED, SEED + 600):
         demos.record_episode(environment, SMALL, seed)  # type: ignore[arg-type]

@@ -16,6 +16,7 @@ from saccade_lab.libero.expert import (
     ONTO_PLATE,
     Expert,
     Situation,
+    Vector,
     downward,
     rotation_vector,
 )
@@ -194,7 +195,7 @@ def missed(seed: int) -> tuple[Toy, Expert, bool, list[Float32Array]]:
 
 
 def test_a_miss_ends_anywhere_but_with_the_box_in_the_hand() -> None:
-    opened, carried, gone_on = [], [], 0
+    opened, carried, gone_on = list[Vector](), list[Vector](), 0
     for seed in range(60):
         world, _, was_missed, executed = missed(seed)
         if not was_missed:
