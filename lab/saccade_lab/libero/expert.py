@@ -114,11 +114,12 @@ class Expert:
         phase: What it is doing, a key of ``LIMITS``.
     """
 
+    _hand: Vector  # where the hand was one step ago
+
     def __init__(self, world: World, technique: Technique) -> None:
         self._world, self._technique = world, technique
         seen = world.situation()
         self._down = downward(seen.rotation)
-        self._hand = seen.hand
         self._held_at = seen.hand  # where it closed or opened the gripper last
         self._start(seen)
 
@@ -156,8 +157,7 @@ class Expert:
         over = max(summit + grasp.hang + OVER_GOAL, grasp.top + ABOVE)
         late = self._steps > LIMITS[self.phase]
         if self.phase in ("above", "down") and abs(seen.target[:, 2].max() - grasp.top) > TOPPLED:
-            self._plan(seen)
-            self._begin("above")
+            self._start(seen)
             return hand, OPEN
         if self.phase == "above":
             goal = np.append(seen.body[:2] + self._offset, grasp.top + ABOVE)
@@ -184,8 +184,7 @@ class Expert:
                 self._begin("carry")
             return np.append(self._held_at[:2], over + 0.02), CLOSE
         if self.phase in ("carry", "lower") and np.linalg.norm(hand - seen.body) > LOST:
-            self._plan(seen)
-            self._begin("above")
+            self._start(seen)
             return hand + RISE, OPEN
         middle = 0.5 * (seen.goal.min(axis=0) + seen.goal.max(axis=0))[:2]
         if self.phase in ("carry", "lower"):  # the object may turn in the hand
@@ -206,8 +205,7 @@ class Expert:
                 self._begin("retreat")
             return self._held_at, OPEN
         if late:  # it has let go, and the task is not done
-            self._plan(seen)
-            self._begin("above")
+            self._start(seen)
         return self._held_at + RETREAT, OPEN
 
 
