@@ -9,6 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from saccade._internal.files import sha256_of
+from saccade._internal.hub_files import STATISTICS
+from saccade.robots.data_configs import RELEASED
 
 
 def path_text(path: Path) -> str:
@@ -40,8 +42,8 @@ def writable_directory(path: Path) -> Path:
 def checkpoint_identity(checkpoint: Path) -> dict[str, str]:
     """``name`` and ``sha256`` of a checkpoint.
 
-    The hash covers the tensors and what decides how they are used: config, tokenizer and statistics, where
-    there are such files.
+    The hash covers the tensors and what decides how they are used: config, tokenizer, statistics and what an
+    observation must contain, where there are such files.
     """
     directory = checkpoint if checkpoint.is_dir() else checkpoint.parent
     tensors = sorted(directory.glob("*.safetensors")) if checkpoint.is_dir() else [checkpoint]
@@ -54,10 +56,35 @@ def checkpoint_identity(checkpoint: Path) -> dict[str, str]:
             "experiment_cfg/data_config.json",
         )
     ]
+    # After the others, so that checkpoints without these files keep the hash that their records have.
+    found = {one for pattern in STATISTICS for one in directory.glob(pattern)}
     return {
         "name": checkpoint.resolve().name,
-        "sha256": sha256_of(*filter(Path.is_file, companions), *tensors),
+        "sha256": sha256_of(
+            *filter(Path.is_file, companions), *tensors, *sorted(found.difference(companions, tensors))
+        ),
     }
+
+
+def overrides(
+    data_config: str | None, action_horizon: int | None, processor_options: Mapping[str, Any] | None
+) -> dict[str, Any]:
+    """What a record says of these options of ``saccade.Policy.from_pretrained``: those that are given.
+
+    A data config is its released name, or the hash of its file.
+
+    Example:
+        >>> overrides("so100", None, None)
+        {'data_config': 'so100'}
+    """
+    found: dict[str, Any] = {
+        "data_config": data_config,
+        "action_horizon": action_horizon,
+        "processor_options": None if processor_options is None else dict(processor_options),
+    }
+    if data_config is not None and data_config not in RELEASED:
+        found["data_config"] = {"sha256": sha256_of(Path(data_config))}
+    return {name: value for name, value in found.items() if value is not None}
 
 
 def changed(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:

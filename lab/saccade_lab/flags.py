@@ -12,9 +12,11 @@ from saccade._internal.flags import (
     Arguments,
     UsageError,
     add_config,
+    add_data_config,
     add_features,
     add_integer,
     add_list,
+    add_overrides,
     add_pictures,
     add_preprocessing,
     add_seed,
@@ -25,6 +27,7 @@ from saccade_lab.sim.tasks import TASKS
 #: The flags that ``add_frames`` declares besides ``--frames``.
 WITH_FRAMES = (
     *("instruction", "state", "precision", "embodiment", "preprocessing", "tokenizer"),
+    *("data_config", "action_horizon", "processor_options"),
     *("other_frames", "other_instruction"),  # of `saccade study patching`
 )
 
@@ -84,6 +87,8 @@ def add_frames(parser: argparse.ArgumentParser) -> None:
         "--precision", choices=PRECISIONS, help="of the backbone (default: float32, as the head always)"
     )
     add_preprocessing(seen)
+    add_data_config(seen)
+    add_overrides(seen)
 
 
 def check_frames(args: argparse.Namespace, *refused: str) -> None:

@@ -45,8 +45,9 @@ def test_another_chunk_as_the_reference_has_it(isa: str, kind: str, tmp_path: Pa
     own = saccade.HeadConfig.from_dict(config).action_horizon
     for horizon in (own - 2, own + 1):
         head = saccade.ActionHead.from_pretrained(tmp_path, action_horizon=horizon)
+        reference = Reference.from_pretrained(tmp_path, action_horizon=horizon, dtype=torch.float64)
         longer = config | {"action_horizon": horizon}
-        reference = Reference.from_pretrained(tmp_path, config=longer, dtype=torch.float64)
+        assert reference.config == Reference.from_pretrained(tmp_path, config=longer).config
         inputs = random_inputs(head.config, 4, batch=2, num_vl_tokens=6)
         with torch.no_grad():
             assert relative_error(head(**arrays(inputs)), reference(**inputs)) <= TOLERANCE
@@ -74,6 +75,8 @@ def test_more_than_the_position_table_has_is_refused(tmp_path: Path) -> None:
     assert saccade.ActionHead.from_pretrained(tmp_path, action_horizon=7).config.action_horizon == 7
     with pytest.raises(saccade.InputError, match=r"action_horizon: expected 1 to 7 .*max_seq_len.*got 8"):
         saccade.ActionHead.from_pretrained(tmp_path, action_horizon=8)
+    with pytest.raises(saccade.InputError, match="action_horizon: expected 1 to 7, got 8"):
+        Reference.from_pretrained(tmp_path, action_horizon=8)
 
 
 def test_a_head_without_positions_has_no_such_limit(tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ from saccade._internal.flags import UsageError, flags_given
 from saccade.cli import EXIT_OK, output
 from saccade_lab import flags as lab_flags
 from saccade_lab.extras import LAB, require
-from saccade_lab.files import writable_directory
+from saccade_lab.files import overrides, writable_directory
 
 if TYPE_CHECKING:
     from saccade.head.config import HeadConfig
@@ -52,7 +52,8 @@ A map shows what a row attends to, not what matters; the occlusion map shows wha
 examples:
   saccade attention --task push --seed 3
   saccade attention --checkpoint out/policy --task reach --after 24 --blocks 0,2 --steps 3
-  saccade attention --checkpoint GR00T-N1.5-3B/ --frames table/ --instruction "pick up the pear"
+  saccade attention --checkpoint GR00T-N1.5-3B/ --frames table/ --instruction "pick up the pear" \\
+    --embodiment gr1 --data-config fourier_gr1_arms_only
   saccade attention --checkpoint checkpoint/ --features step.npz --heads 0,5,12
   saccade attention --checkpoint checkpoint/ --features step.safetensors \\
     --layout "text:20,image:16x16,text:*" --json
@@ -264,11 +265,8 @@ def take_frames(args: argparse.Namespace, checkpoint: Path) -> tuple[ActionHead,
     with output.progress_bar("loading", transient=True):
         policy = Policy.from_pretrained(
             checkpoint,
-            embodiment=args.embodiment,
-            preprocessing=args.preprocessing,
-            tokenizer=args.tokenizer,
             precision={"backbone": args.precision or "float32", "head": "float32"},
-            num_threads=args.num_threads,
+            **arguments.loading_options(args),
         )
     parts = parts_of(policy)
     recorded = read_frames(args.frames, policy, instruction=args.instruction, state=args.state)
@@ -289,6 +287,7 @@ def take_frames(args: argparse.Namespace, checkpoint: Path) -> tuple[ActionHead,
             "embodiment_id": policy.embodiment_id,
             "precision": args.precision or "float32",
             "preprocessing": parts.processor.preprocessing,
+            **overrides(args.data_config, args.action_horizon, args.processor_options),
             "noise": f"seed {args.seed}",
         },
     )

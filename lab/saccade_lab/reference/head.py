@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from os import PathLike
 from typing import Any
 
@@ -23,6 +24,7 @@ from torch import Tensor
 from saccade._internal.arrays import integer
 from saccade._internal.hub import resolve
 from saccade._internal.hub_files import HEAD
+from saccade.errors import InputError
 from saccade.head.chunking import Chunking
 from saccade.head.config import HeadConfig
 from saccade.head.intervention import Intervention, Tokens
@@ -85,6 +87,7 @@ class ActionHead(VelocityNetwork):
         *,
         revision: str | None = None,
         config: Mapping[str, Any] | str | PathLike[str] | None = None,
+        action_horizon: int | None = None,
         num_states: int | None = None,
         dtype: torch.dtype = torch.float32,
     ) -> ActionHead:
@@ -97,7 +100,7 @@ class ActionHead(VelocityNetwork):
             config: The config of the checkpoint or of the head, as a dict or a path. Default: the
                 ``config.json`` in the same directory, or else the ``config`` entry in the metadata of a
                 single file.
-            num_states: Number of states in an observation, as for :meth:`saccade.ActionHead.from_pretrained`.
+            action_horizon, num_states: As for :meth:`saccade.ActionHead.from_pretrained`.
             dtype: Dtype of the parameters. Narrower stored dtypes are widened, which is exact.
 
         Raises:
@@ -105,15 +108,20 @@ class ActionHead(VelocityNetwork):
             PermissionError: The Hub denies access to the id.
             CheckpointError: There is no config, or tensors are missing, unknown or of the wrong shape. The
                 message lists all of them.
-            InputError: ``num_states`` is out of range.
+            InputError: ``action_horizon`` or ``num_states`` is out of range.
         """
         checkpoint = loading.described(resolve(id_or_path, revision, files=HEAD), config)
         whole, names = checkpoint.head_config, loading.tensor_names(checkpoint)
         has_state_dropout = STATE_DROPOUT in names
         drops = drops_states(whole, has_state_dropout)
+        sizes = HeadConfig.from_dict(whole, num_states=num_states)
+        if action_horizon is not None:
+            sizes = replace(sizes, action_horizon=integer("action_horizon", action_horizon))
+            if sizes.add_pos_embed and sizes.action_horizon > sizes.max_positions:
+                raise InputError(f"action_horizon: expected 1 to {sizes.max_positions}, got {action_horizon}")
         with torch.device("meta"):  # no memory and no time for an initialisation that is replaced
             head = cls(
-                HeadConfig.from_dict(whole, num_states=num_states),
+                sizes,
                 time_distribution=TimeDistribution.from_dict(whole),
                 unused=filter(is_unused, names),
                 has_state_dropout=has_state_dropout,

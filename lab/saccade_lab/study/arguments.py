@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import json
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -96,6 +97,9 @@ def pictures_of(args: argparse.Namespace) -> PictureSource:
         precision=args.precision or "float32",
         preprocessing=args.preprocessing,
         tokenizer=None if args.tokenizer is None else path_text(args.tokenizer),
+        data_config=args.data_config,
+        action_horizon=args.action_horizon,
+        processor_options=None if args.processor_options is None else json.dumps(args.processor_options),
         seed=args.seed,
         num_threads=None if workers_of(args).alone else 1,
     )

@@ -21,7 +21,7 @@ from saccade.observations import read
 from saccade.observations.pictures import PictureObservation, read_frames
 from saccade.policy.encoding import pad_tokens
 from saccade.policy.policy import Policy
-from saccade_lab.files import checkpoint_identity
+from saccade_lab.files import checkpoint_identity, overrides
 from saccade_lab.head_inputs import HeadInputs
 from saccade_lab.inside import context_of, features_of, head_inputs, inputs_of, parts_of
 from saccade_lab.maps.grid import layout_of
@@ -44,7 +44,9 @@ class PictureSource(Recorded):
         instruction, state: As ``read_frames`` takes them.
         other_frames, other_instruction: Of the observations to compare with. Where one is None, it is that of
             the others; with both None nothing is compared.
-        embodiment, preprocessing, tokenizer: As ``saccade.Policy.from_pretrained`` takes them.
+        embodiment, preprocessing, tokenizer, data_config, action_horizon: As
+            ``saccade.Policy.from_pretrained`` takes them.
+        processor_options: The same, as JSON.
         precision: How the backbone computes.
         seed: Seed of random tokens and of the noise.
         num_threads: Number of threads. Default: that of the engine.
@@ -61,6 +63,9 @@ class PictureSource(Recorded):
     precision: str = "float32"
     preprocessing: Preprocessing | None = None
     tokenizer: str | None = None
+    data_config: str | None = None
+    action_horizon: int | None = None
+    processor_options: str | None = None
     seed: int = 0
     num_threads: int | None = None
     on_observation: Callable[[int, int], None] | None = field(default=None, compare=False, repr=False)
@@ -69,8 +74,12 @@ class PictureSource(Recorded):
     @property
     def files(self) -> tuple[str, ...]:
         """See ``Source``."""
-        read = (self.frames, self.other_frames, self.state, self.tokenizer)
+        read = (self.frames, self.other_frames, self.state, self.tokenizer, self.data_config)
         return (*super().files, *(path for path in read if path is not None and Path(path).exists()))
+
+    @property
+    def _processor_options(self) -> dict[str, Any] | None:
+        return None if self.processor_options is None else json.loads(self.processor_options)
 
     def describe(self) -> dict[str, Any]:
         """See ``Source``."""
@@ -84,6 +93,7 @@ class PictureSource(Recorded):
                 "noise": f"{NOISES} draws an observation",
                 "precision": self.precision,
                 "preprocessing": encoded.preprocessing,
+                **overrides(self.data_config, self.action_horizon, self._processor_options),
                 "embodiment_id": int(encoded.observation.embodiment_id[0]),
                 "action_width": encoded.action_width,
                 "other": other,
@@ -96,7 +106,10 @@ class PictureSource(Recorded):
         if precision != "float32":
             raise InputError(f"precision: expected float32 for a head on pictures, got {precision}")
         (embodiment_id,) = set(self.all.embodiment_id.tolist())
-        return head_of(self.checkpoint, embodiment_id, self.num_threads)
+        config = self.config
+        return head_of(
+            self.checkpoint, embodiment_id, config.action_horizon, config.num_states, self.num_threads
+        )
 
     @property
     def config(self) -> HeadConfig:
@@ -160,6 +173,9 @@ def encode(source: PictureSource) -> Encoded:
         embodiment=source.embodiment,
         preprocessing=source.preprocessing,
         tokenizer=source.tokenizer,
+        data_config=source.data_config,
+        action_horizon=source.action_horizon,
+        processor_options=source._processor_options,
         precision={"backbone": source.precision, "head": "float32"},
         num_threads=source.num_threads,
     )
@@ -200,9 +216,17 @@ def encode(source: PictureSource) -> Encoded:
 
 
 @functools.lru_cache(maxsize=1)
-def head_of(checkpoint: str, embodiment_id: int, num_threads: int | None) -> ActionHead:
-    """The head with the layers of one embodiment."""
-    return ActionHead.from_pretrained(checkpoint, embodiment_ids=[embodiment_id], num_threads=num_threads)
+def head_of(
+    checkpoint: str, embodiment_id: int, action_horizon: int, num_states: int, num_threads: int | None
+) -> ActionHead:
+    """The head with the layers of one embodiment, as the policy had it."""
+    return ActionHead.from_pretrained(
+        checkpoint,
+        embodiment_ids=[embodiment_id],
+        action_horizon=action_horizon,
+        num_states=num_states,
+        num_threads=num_threads,
+    )
 
 
 def pictures_of(

@@ -322,7 +322,13 @@ def reference_of(source: Source) -> ActionHead:
 
     if source.num_threads is not None:
         torch.set_num_threads(source.num_threads)
-    head = ActionHead.from_pretrained(source.checkpoint, config=source.config_file)
+    config = source.config
+    head = ActionHead.from_pretrained(
+        source.checkpoint,
+        config=source.config_file,
+        action_horizon=config.action_horizon,
+        num_states=config.num_states,
+    )
     head.requires_grad_(False)
     return head
 

@@ -1,0 +1,108 @@
+"""How a whole checkpoint is loaded for a study on pictures: its data config and what else it does not say."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from saccade import Policy
+from saccade.cli import main
+from saccade.observations.pictures import read_frames
+from saccade_lab.files import checkpoint_identity, overrides
+from saccade_lab.inside import head_inputs
+from saccade_lab.study.pictures import PictureSource, encode
+from saccade_lab.study.questions.gradients import reference_of
+from saccade_lab.study.table import read_provenance
+from tests.helpers.frames_cases import write_pictures_of
+from tests.helpers.whole_checkpoints import EMBODIMENT, whole
+
+TOLD = "open the drawer"
+CONFIG = {
+    "video_keys": ["video.wrist", "video.front"],
+    "state_keys": ["state.hand", "state.arm"],
+    "action_keys": ["action.arm", "action.hand"],
+    "language_keys": ["annotation.human.task_description"],
+    "observation_indices": [0],
+    "action_indices": [0, 1, 2],
+    "state_modes": {"state.arm": "q99", "state.hand": "min_max"},
+    "action_modes": {"action.arm": "min_max", "action.hand": "min_max"},
+    "target_rotations": {},
+}
+
+
+@pytest.fixture(scope="module")
+def frames(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_pictures_of(tmp_path_factory.mktemp("frames") / "table", "pour/1", "wipe/1")
+
+
+@pytest.fixture
+def config(tmp_path: Path) -> Path:
+    path = tmp_path / "keys.json"
+    path.write_text(json.dumps(CONFIG))
+    return path
+
+
+def test_a_data_config_decides_inputs_and_horizon(frames: Path, config: Path) -> None:
+    source = PictureSource(
+        str(whole("isaac")), str(frames), TOLD, embodiment=EMBODIMENT, data_config=str(config), num_threads=1
+    )
+    policy = Policy.from_pretrained(
+        whole("isaac"), embodiment=EMBODIMENT, data_config=CONFIG, num_threads=1, precision="float32"
+    )
+    for row, picture in enumerate(read_frames(frames, policy, instruction=TOLD)):
+        (features,) = policy.encode(picture.observation).features
+        expected, found = head_inputs(policy, picture.observation, features), source.all.row(row)
+        np.testing.assert_array_equal(found.backbone_features, expected.backbone_features)
+        np.testing.assert_array_equal(found.state, expected.state)
+    assert source.config == policy.head.config
+    assert (source.config.action_horizon, source.head().config.action_horizon) == (3, 3)
+    assert reference_of(source).config == source.config
+    assert source.observed("frames", 0).sample(source.head()).shape[-2] == 3
+    assert encode(source).layouts[0].cameras[0].name == "wrist"
+
+
+def test_commands_take_and_record_it(frames: Path, config: Path, tmp_path: Path) -> None:
+    words = ["--checkpoint", str(whole("isaac")), "--frames", str(frames), "--instruction", TOLD]
+    words += ["--embodiment", EMBODIMENT, "--data-config", str(config)]
+    out = str(tmp_path / "study")
+    assert main(["study", "gradients", *words, "--projections", "1", "--out", out]) == 0
+    assert main(["study", "cuts", *words, "--arms", "future-unread", "--out", out]) == 0
+    recorded = overrides(str(config), None, None)
+    settings = read_provenance(tmp_path / "study" / "cuts.json").settings["frames"]
+    assert recorded["data_config"] == settings["data_config"]
+    few = ["--blocks", "0", "--steps", "0", "--cell", "4", "--out", str(tmp_path / "maps")]
+    assert main(["attention", *words, *few]) == 0
+    found = json.loads((tmp_path / "maps" / "attention.json").read_text())
+    assert found["source"]["data_config"] == recorded["data_config"]
+    assert [camera["name"] for camera in found["layout"]["cameras"]] == ["wrist", "front"]
+
+
+def test_another_horizon_and_processor(frames: Path, tmp_path: Path) -> None:
+    words = ["--checkpoint", str(whole("n17")), "--frames", str(frames), "--instruction", TOLD]
+    words += ["--embodiment", EMBODIMENT, "--action-horizon", "20"]
+    words += ["--processor-options", '{"letter_box_transform": true}']
+    out = str(tmp_path / "study")
+    assert main(["study", "gradients", *words, "--projections", "1", "--out", out]) == 0
+    settings = read_provenance(tmp_path / "study" / "gradients.json").settings["frames"]
+    assert settings["action_horizon"] == 20
+    assert settings["processor_options"] == {"letter_box_transform": True}
+
+
+@pytest.mark.parametrize("command", ["study cuts", "attention"])
+def test_they_need_pictures(command: str, config: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([*command.split(), "--data-config", str(config), "--action-horizon", "3"]) == 2
+    assert "--data-config, --action-horizon: only with --frames" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", ["statistics.json", "processor_config.json", "embodiment_id.json"])
+def test_the_hash_of_a_checkpoint_covers_its_statistics(name: str, tmp_path: Path) -> None:
+    folder = shutil.copytree(whole("n17"), tmp_path / "n17")
+    before = checkpoint_identity(folder)
+    (folder / name).write_text((folder / name).read_text() + "\n")
+    after = checkpoint_identity(folder)
+    assert (before["name"], after["name"]) == ("n17", "n17")
+    assert before["sha256"] != after["sha256"]
