@@ -67,11 +67,15 @@ class Contenders:
             process = spawn.Process(target=worker, args=(theirs, name, case, source, scratch), daemon=True)
             with environment({"OMP_NUM_THREADS": str(case.threads), "THP_MEM_ALLOC_ENABLE": "1"}):
                 process.start()
+            theirs.close()  # so that the end of the process ends the pipe
             self._processes.append(process)
             self._answer(name)
 
     def _answer(self, name: str) -> Any:
-        answer = self._pipes[name].recv()
+        try:
+            answer = self._pipes[name].recv()
+        except EOFError:
+            raise RuntimeError(f"{name}: its process ended, perhaps for lack of memory") from None
         if isinstance(answer, Exception):
             raise answer
         return answer

@@ -14,9 +14,10 @@ import pytest
 import saccade
 from saccade.cli import main
 from saccade_lab.libero import demos
-from saccade_lab.libero.checkpoint import ACTION_GROUPS, CAMERAS, STATE_GROUPS
+from saccade_lab.libero.checkpoint import CAMERAS
 from saccade_lab.libero.environment import LiberoEnvironment
 from saccade_lab.libero.expert import OPEN, Expert
+from saccade_lab.libero.layout import ACTION_GROUPS, STATE_GROUPS
 from saccade_lab.libero.recording import read_recordings
 from saccade_lab.libero.scene import Scene
 from saccade_lab.parallel import Workers

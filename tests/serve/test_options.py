@@ -341,6 +341,18 @@ def test_modality_configs_of_a_data_config() -> None:
     assert plain["language"] == text["language"]
 
 
+def test_modality_configs_of_fewer_actions_than_lerobot_says() -> None:
+    """The config has as many steps as the answers have actions."""
+    policy = saccade.Policy.from_pretrained(
+        whole_checkpoints.whole("lerobot"), action_horizon=3, num_threads=1
+    )
+    assert policy.normalizer.action_horizon is not None
+    assert policy.normalizer.action_horizon > 3
+    (lengths,) = {chunk.shape[1] for chunk in policy.act(policy.example_observation(), seed=0).values()}
+    found = modalities.answers(policy)["map"]["action"]["as_json"]["delta_indices"]
+    assert (lengths, found) == (3, [0, 1, 2])
+
+
 def test_modality_configs_in_the_folder_processor(tmp_path: Path) -> None:
     checkpoint = whole_checkpoints.whole("n17")
     file = json.loads((checkpoint / "processor_config.json").read_text())

@@ -18,6 +18,7 @@ from saccade.head.config import HeadConfig
 from saccade.processor import Processor
 from saccade.robots import LANGUAGE_KEY, Normalizer
 from saccade_lab.backbone_sizes import BackboneSizes, eagle_config
+from saccade_lab.libero.layout import ACTION_DIM, ACTION_GROUPS, CONTROL_HZ, STATE_DIM, STATE_GROUPS
 from saccade_lab.random_checkpoint.robot_metadata import metadata
 from saccade_lab.random_checkpoint.tokenizer import tokenizer
 from saccade_lab.sim.settings import (
@@ -37,10 +38,6 @@ VERSIONS = ("n1.5", "n1.7")
 EMBODIMENT = "libero_sim"
 EMBODIMENT_ID = 0
 CAMERAS = ("image", "wrist_image")
-POSE = {"x": 1, "y": 1, "z": 1, "roll": 1, "pitch": 1, "yaw": 1}
-STATE_GROUPS, ACTION_GROUPS = {**POSE, "gripper": 2}, {**POSE, "gripper": 1}
-STATE_DIM, ACTION_DIM = sum(STATE_GROUPS.values()), sum(ACTION_GROUPS.values())
-CONTROL_HZ = 20
 PATCH_SIZE = 16  # of both towers, in pixels; four patches become an image token
 
 

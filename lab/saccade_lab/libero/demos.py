@@ -17,9 +17,10 @@ import numpy as np
 
 from saccade.datasets import Writer
 from saccade.errors import InputError
-from saccade_lab.libero.checkpoint import ACTION_GROUPS, CAMERAS, CONTROL_HZ, STATE_GROUPS, policy_actions
+from saccade_lab.libero.checkpoint import CAMERAS, policy_actions
 from saccade_lab.libero.expert import INTO_BASKET, ONTO_PLATE, Expert, Technique
 from saccade_lab.libero.grasps import Points
+from saccade_lab.libero.layout import ACTION_GROUPS, CONTROL_HZ, STATE_GROUPS
 from saccade_lab.libero.misses import MISS_SHARE, miss
 from saccade_lab.libero.placements import TRADE_SHARE, wider
 from saccade_lab.libero.recording import LiberoRecording

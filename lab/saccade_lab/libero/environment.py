@@ -12,7 +12,8 @@ from gymnasium import spaces
 from saccade._internal.arrays import UInt8Array
 from saccade.errors import InputError, ShapeError
 from saccade_lab.libero.drawing import CAMERAS, CameraRenderer
-from saccade_lab.libero.simulation import CONTROL_HZ, Simulation
+from saccade_lab.libero.layout import ACTION_DIM, CONTROL_HZ
+from saccade_lab.libero.simulation import Simulation
 from saccade_lab.libero.state import Float32Array, Proprioception, isaac_state, lerobot_state
 from saccade_lab.libero.suites import find_task, initial_states
 from saccade_lab.sim.scenarios import StepOutcome
@@ -20,8 +21,6 @@ from saccade_lab.sim.scenarios import StepOutcome
 #: ``{"images": {name: (H, W, 3) uint8}, "state": (8,) float32, "instruction": str}``
 LiberoObservation = dict[str, Any]
 
-ACTION_DIM = 7
-STATE_DIM = 8
 DEFAULT_IMAGE_SIZE = 256
 DEFAULT_SETTLE_STEPS = 10
 SEEDS = 2**32  # NumPy's legacy generator takes seeds below this

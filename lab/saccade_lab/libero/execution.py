@@ -9,6 +9,7 @@ from typing import Any
 from saccade import Policy
 from saccade._internal.small_files import read_json
 from saccade.errors import CheckpointError, InputError
+from saccade.policy.loading import returned_horizon
 from saccade.robots.libero import EXECUTED_STEPS, TAG, is_isaac_libero
 from saccade_lab.libero.protocols import Protocol
 
@@ -40,8 +41,7 @@ def execute_steps(policy: Policy, checkpoint: Path, protocol: Protocol) -> tuple
         ...     return execute_steps(policy, folder, PROTOCOLS["isaac-n17"])[0]
     """
     normalizer = policy.normalizer
-    denoised = policy.head.config.action_horizon
-    horizon = min(normalizer.action_horizon or denoised, denoised)
+    horizon = returned_horizon(policy.head, normalizer)
     trained = min(horizon, normalizer.trained_horizon or horizon)
     if protocol.execute_steps is not None:
         if trained < protocol.execute_steps:

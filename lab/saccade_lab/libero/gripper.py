@@ -10,7 +10,7 @@ from saccade import Policy
 from saccade._internal.arrays import Float32Array
 from saccade.errors import InputError
 from saccade.robots.groups import Group
-from saccade.robots.libero import TAG, is_isaac_libero
+from saccade.robots.libero import TAG, gripper_command, is_isaac_libero
 from saccade_lab.libero.protocols import AS_GIVEN, OPEN_IS_ONE, Protocol
 
 #: How far bounds of statistics may be from the two known ranges.
@@ -44,7 +44,7 @@ class GripperRule:
         if self.rule == AS_GIVEN:
             return actions
         found = actions.copy()
-        found[:, -1] = -np.sign(2 * found[:, -1] - 1)
+        found[:, -1] = gripper_command(found[:, -1])
         return found
 
 

@@ -17,22 +17,14 @@ import numpy as np
 import saccade
 from saccade._internal.arrays import Float32Array, UInt8Array
 from saccade.errors import InputError
+from saccade.robots import LANGUAGE_KEY
 from saccade_lab.libero.execution import execute_steps
 from saccade_lab.libero.gripper import gripper_rule
+from saccade_lab.libero.layout import ACTION_DIM, ACTION_GROUPS, STATE_DIM, STATE_GROUPS
 from saccade_lab.libero.protocols import AUTO, Protocol, choose_protocol
-
-#: The numbers of an action in the environment's order: a step of the hand in the world's axes, a rotation
-#: vector, and the gripper.
-ACTION_KEYS = ("x", "y", "z", "roll", "pitch", "yaw", "gripper")
-#: The state: position of the hand, its rotation vector (under Isaac-GR00T's names), the two fingers.
-STATE_SIZES = {"x": 1, "y": 1, "z": 1, "roll": 1, "pitch": 1, "yaw": 1, "gripper": 2}
-ACTION_DIM, STATE_DIM = len(ACTION_KEYS), sum(STATE_SIZES.values())
 
 #: Names that released checkpoints have for the two cameras of the environment.
 CAMERAS = {"image": ("image",), "wrist_image": ("wrist_image", "image2")}
-#: The language key of Isaac-GR00T's clients.
-LANGUAGE = "annotation.human.action.task_description"
-
 #: Whose steps prepare frames and words, by ``Processor.preprocessing``.
 PROGRAMS = {"isaac": "Isaac-GR00T's", "lerobot": "lerobot's"}
 
@@ -151,12 +143,12 @@ class LiberoPolicy:
                 "observation.state": state,
                 "task": seen["instruction"],
             }
-        parts = np.split(state, np.cumsum(list(STATE_SIZES.values()))[:-1])
-        named = dict(zip(STATE_SIZES, parts, strict=True))
+        parts = np.split(state, np.cumsum(list(STATE_GROUPS.values()))[:-1])
+        named = dict(zip(STATE_GROUPS, parts, strict=True))
         return {
             **{f"video.{name}": frame[None] for name, frame in frames.items()},
             **{f"state.{name}": part[None] for name, part in named.items()},
-            self.whole.requirements.language_key or LANGUAGE: [seen["instruction"]],
+            self.whole.requirements.language_key or LANGUAGE_KEY: [seen["instruction"]],
         }
 
     def act(self, seen: Mapping[str, Any], *, seed: int) -> Chunk:
@@ -195,7 +187,7 @@ def as_floats(frame: UInt8Array) -> Float32Array:
 
 
 def action_places(policy: saccade.Policy, *, ordered: bool) -> list[int]:
-    """For each of ``ACTION_KEYS`` its place in the action of a policy.
+    """For each of ``ACTION_GROUPS`` its place in the action of a policy.
 
     ``ordered`` is whether they must be in this order, because the protocol's program does not look at keys.
 
@@ -203,18 +195,18 @@ def action_places(policy: saccade.Policy, *, ordered: bool) -> list[int]:
         InputError: The action has other keys.
     """
     sizes = {group.key: group.size for group in policy.normalizer.action_groups}
-    if sizes == dict.fromkeys(ACTION_KEYS, 1) and (not ordered or tuple(sizes) == ACTION_KEYS):
-        return [list(sizes).index(key) for key in ACTION_KEYS]
+    if sizes == ACTION_GROUPS and (not ordered or tuple(sizes) == tuple(ACTION_GROUPS)):
+        return [list(sizes).index(key) for key in ACTION_GROUPS]
     if list(sizes.values()) == [ACTION_DIM] and policy.normalizer.pipeline is not None:
         return list(range(ACTION_DIM))
     raise InputError(
-        f"checkpoint: expected the actions of LIBERO in this order, {', '.join(ACTION_KEYS)}, or lerobot's "
+        f"checkpoint: expected the actions of LIBERO in this order, {', '.join(ACTION_GROUPS)}, or lerobot's "
         f"action of {ACTION_DIM}, got {_listed(sizes)}"
     )
 
 
 def check_state(policy: saccade.Policy, *, ordered: bool) -> None:
-    """Checks that the state has a key for each of ``STATE_SIZES``, or is lerobot's one of 8 numbers.
+    """Checks that the state has a key for each of ``STATE_GROUPS``, or is lerobot's one of 8 numbers.
 
     ``ordered`` is as for ``action_places``.
 
@@ -222,10 +214,10 @@ def check_state(policy: saccade.Policy, *, ordered: bool) -> None:
         InputError: It is neither.
     """
     sizes = dict(policy.requirements.state)
-    is_named = sizes == STATE_SIZES and (not ordered or tuple(sizes) == tuple(STATE_SIZES))
+    is_named = sizes == STATE_GROUPS and (not ordered or tuple(sizes) == tuple(STATE_GROUPS))
     if not is_named and (list(sizes.values()) != [STATE_DIM] or policy.normalizer.pipeline is None):
         raise InputError(
-            f"checkpoint: expected the state of LIBERO in this order, {_listed(STATE_SIZES)}, or lerobot's "
+            f"checkpoint: expected the state of LIBERO in this order, {_listed(STATE_GROUPS)}, or lerobot's "
             f"of {STATE_DIM}, got {_listed(sizes)}"
         )
 

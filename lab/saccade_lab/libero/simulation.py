@@ -17,13 +17,13 @@ import numpy.typing as npt
 
 from saccade_lab.libero import packages
 from saccade_lab.libero.drawing import RecordedScene
+from saccade_lab.libero.layout import CONTROL_HZ
 from saccade_lab.libero.state import Proprioception
 from saccade_lab.sim.scenarios import StepOutcome
 
 if TYPE_CHECKING:
     import mujoco
 
-CONTROL_HZ = 20
 #: Steps of an episode, settling included, after which robosuite refuses to continue.
 HORIZON = 1000
 ROBOT = "Panda"

@@ -6,13 +6,8 @@ from collections.abc import Sequence
 from typing import Any
 
 from saccade.errors import InputError
-from saccade_lab.libero.checkpoint import (
-    ACTION_DIM,
-    PATCH_SIZE,
-    STATE_DIM,
-    VERSIONS,
-    LiberoConfig,
-)
+from saccade_lab.libero.checkpoint import PATCH_SIZE, VERSIONS, LiberoConfig
+from saccade_lab.libero.layout import ACTION_DIM, STATE_DIM
 from saccade_lab.random_checkpoint.tokenizer import token_id
 from saccade_lab.sim.settings import vocabulary
 from saccade_lab.training.settings import TrainingSettings

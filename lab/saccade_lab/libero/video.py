@@ -8,7 +8,7 @@ from PIL import Image, ImageDraw, ImageFont
 from saccade._internal.arrays import UInt8Array
 from saccade_lab.libero.environment import LiberoEnvironment
 from saccade_lab.libero.episode import Episode
-from saccade_lab.libero.simulation import CONTROL_HZ
+from saccade_lab.libero.layout import CONTROL_HZ
 from saccade_lab.sim.video import GREEN, INK, PAPER, VideoWriter
 
 EVERY = 2  # control steps between pictures

@@ -19,8 +19,8 @@ class SaccadeConfig(PreTrainedConfig):
     """The options ``--policy.*`` of ``--policy.type=saccade``.
 
     Attributes:
-        checkpoint: The directory of a whole GR00T checkpoint, or its id in the local cache of
-            ``huggingface_hub``. Required, except for a directory that ``save_pretrained`` wrote.
+        checkpoint: The directory of a whole GR00T checkpoint, or a published id, which is downloaded.
+            Required, except for a directory that ``save_pretrained`` wrote.
         embodiment: Tag or id of the robot. Required if the checkpoint has statistics of several robots.
         precision: How the backbone computes, and the head: float32, bfloat16, int8 or
             int4.

@@ -9,6 +9,7 @@ from typing import Any
 from huggingface_hub import snapshot_download
 from huggingface_hub.errors import GatedRepoError, RepositoryNotFoundError, RevisionNotFoundError
 
+from saccade._internal import hub_files
 from saccade._internal.hub import PUBLISHED, resolve
 from saccade._internal.tokenizers import tokenizer_path
 from saccade.errors import InputError
@@ -25,16 +26,6 @@ DATA_CONFIG_FILE = "data_config.json"
 
 #: What saccade reads of a checkpoint. Other files, such as an optimizer's state, are not fetched or copied.
 FILES = ("*.json", "*.safetensors", "*.txt")
-
-#: What saccade reads in the folder of a tokenizer; a tokenizer in one file may have any name.
-TOKENIZER_FILES = (
-    "tokenizer.json",
-    "vocab.json",
-    "merges.txt",
-    "added_tokens.json",
-    "tokenizer_config.json",
-    "preprocessor_config.json",
-)
 
 
 def folder_of(name: str | Path, *, revision: str | None, **hub_options: Any) -> Path:
@@ -149,7 +140,7 @@ def _files_of(checkpoint: Path) -> Iterator[Path]:
 def _files_of_tokenizer(path: Path) -> dict[Path, Path]:
     """The files of a tokenizer, by their names in a directory of their own."""
     if path.is_dir():
-        return {Path(name): path / name for name in TOKENIZER_FILES if (path / name).is_file()}
+        return {Path(name): path / name for name in hub_files.TOKENIZER if (path / name).is_file()}
     beside = path.with_name("preprocessor_config.json")
     found = {Path("tokenizer.json"): path}
     return found | ({Path(beside.name): beside} if beside.is_file() else {})

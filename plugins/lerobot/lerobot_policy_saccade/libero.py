@@ -7,10 +7,7 @@ camera by the name that lerobot's data sets and its environment have for it.
 from dataclasses import replace
 
 import saccade
-from saccade.robots.libero import TAG, is_isaac_libero
-
-#: lerobot's second name of a camera.
-ALIASES = {"wrist_image": "image2"}
+from saccade.robots.libero import CAMERA_ALIASES, TAG, is_isaac_libero
 
 
 def is_libero(policy: saccade.Policy) -> bool:
@@ -32,7 +29,7 @@ def as_in_lerobot(policy: saccade.Policy) -> saccade.Policy:
         keys = ", ".join(f"{group.key} ({group.size})" for group in normalizer.action_groups)
         raise saccade.InputError(f"action: expected a gripper of one number for {TAG}, got {keys}")
     cameras = needs.cameras and tuple(
-        replace(camera, alias=ALIASES.get(camera.name, camera.alias)) for camera in needs.cameras
+        replace(camera, alias=CAMERA_ALIASES.get(camera.name, camera.alias)) for camera in needs.cameras
     )
     return saccade.Policy(
         policy.head,

@@ -29,6 +29,7 @@ from lerobot_policy_saccade.lerobot_config import saved_options
 from lerobot_policy_saccade.libero import as_in_lerobot, is_libero
 from lerobot_policy_saccade.processor_saccade import make_saccade_pre_post_processors
 from lerobot_policy_saccade.real_time_chunking import continued
+from saccade.policy.loading import returned_horizon
 from saccade.robots.data_configs import RELEASED
 from saccade.robots.libero import EXECUTED_STEPS
 
@@ -100,8 +101,7 @@ class SaccadePolicy(PreTrainedPolicy):
             )
         saved = saved_options(config.checkpoint)
         self._chunking = saved.chunking
-        denoised = self.policy.head.config.action_horizon
-        horizon = min(normalizer.action_horizon or denoised, denoised)
+        horizon = returned_horizon(self.policy.head, normalizer)
         self._trained = min(horizon, normalizer.trained_horizon or horizon)
         usual = EXECUTED_STEPS if is_libero(policy) else None
         self._steps = _steps(config.n_action_steps, saved.n_action_steps or usual, horizon, self._trained)

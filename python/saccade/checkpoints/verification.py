@@ -159,7 +159,7 @@ def verify(
         except (SaccadeError, FileNotFoundError) as error:
             found.problems += lines_of(error)
     found.problems += [f"{run.name}: {run.problem}" for run in found.runs if run.problem is not None]
-    worst = (found.reference or {}).get("of range", 0.0)
+    worst = 0.0 if found.reference is None else found.reference["of range"]
     if not worst <= TOLERANCE:  # also if it is NaN
         found.problems.append(
             f"float32 differs from the reference by {worst:.1e} of an action's range, expected at most "

@@ -12,6 +12,7 @@ import numpy.typing as npt
 from saccade._internal.arrays import Float32Array
 from saccade.errors import InputError, ShapeError
 from saccade.evaluation.recordings import Recordings, actions_of, length_of, observation_at
+from saccade.policy.loading import returned_horizon
 
 if TYPE_CHECKING:
     from saccade.policy.policy import Policy
@@ -122,8 +123,7 @@ def horizon_of(policy: Policy) -> int:
             "policy: expected action_indices 0, 1, 2, ..., an action for each step from the observed one on, "
             f"got {list(indices)!r:.80}"
         )
-    most = policy.head.config.action_horizon
-    return min(policy.normalizer.action_horizon or most, most)
+    return returned_horizon(policy.head, policy.normalizer)
 
 
 def predict_episode(

@@ -14,10 +14,8 @@ from saccade.observations.requirements import Camera, Requirements
 from saccade.robots import Robot
 from saccade.robots.building import size_of, value_at
 from saccade.robots.lerobot_pipeline import PREPROCESSOR, read_pipeline
+from saccade.robots.libero import CAMERA_ALIASES
 from saccade.robots.reading import processor_folder, processor_version
-
-#: lerobot's groot policies know this camera by two names.
-ALIASES = {"wrist_image": "image2"}
 
 
 def read_requirements(folder: Path, robot: Robot) -> Requirements:
@@ -84,10 +82,10 @@ def _lerobot(folder: Path, values: Mapping[str, Any], robot: Robot) -> Requireme
 def _ordered(keys: list[str], names: list[str]) -> tuple[Camera, ...]:
     """The cameras that N1.7's ``video_modality_keys`` name; without any feature, all that they name."""
     if not names:
-        return tuple(Camera(key, alias=ALIASES.get(key)) for key in keys)
+        return tuple(Camera(key, alias=CAMERA_ALIASES.get(key)) for key in keys)
     found = []
     for key in keys:
-        alias = ALIASES.get(key)
+        alias = CAMERA_ALIASES.get(key)
         if key in names:
             found.append(Camera(key, alias=alias))
         elif alias in names:

@@ -150,6 +150,15 @@ def _chosen(names: Sequence[str], found: Requirements) -> tuple[Camera, ...]:
     return tuple(known[name] for name in chosen)
 
 
+def returned_horizon(head: Head, normalizer: Normalizer) -> int:
+    """Number of actions of a chunk in the robot's units: the robot's, at most as many as the head denoises.
+
+    A lerobot policy may say more, where its head was loaded with fewer.
+    """
+    denoised = head.config.action_horizon
+    return min(normalizer.action_horizon or denoised, denoised)
+
+
 def check_fit(head: Head, normalizer: Normalizer) -> None:
     """Checks that a head and a robot have the same widths, and numbers of steps that fit."""
     config = head.config

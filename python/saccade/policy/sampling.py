@@ -17,6 +17,7 @@ from saccade.observations import ParsedState
 from saccade.policy.encoding import PolicyContext
 from saccade.policy.guidance import check_guides
 from saccade.policy.interfaces import Head
+from saccade.policy.loading import returned_horizon
 from saccade.policy.reading import Batch
 from saccade.robots import Normalizer, padded
 
@@ -118,7 +119,7 @@ def _continued(options: Sampling, state: ArrayLike, head: Head, normalizer: Norm
     previous, chunking = float32("previous_chunk", options.previous_chunk), options.chunking
     if isinstance(chunking, Chunking):
         most = head.config.action_horizon
-        horizon = chunking.horizon or min(normalizer.action_horizon or most, most)
+        horizon = chunking.horizon or returned_horizon(head, normalizer)
         if previous.ndim < 2 or previous.shape[-2] < horizon:
             raise ShapeError(
                 f"previous_chunk: expected a chunk of at least {horizon} actions (horizon of chunking), got "

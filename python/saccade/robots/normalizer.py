@@ -25,6 +25,7 @@ from saccade.robots.building import Options
 from saccade.robots.data_configs import DataConfigLike
 from saccade.robots.data_configs import data_config as read_data_config
 from saccade.robots.groups import Group
+from saccade.robots.libero import gripper_command
 from saccade.robots.reading import read
 from saccade.robots.robot import Robot
 
@@ -231,7 +232,7 @@ class Normalizer(Robot):
             actions = self._by_reference(Group.absolute, actions, latest)
         if self.gripper is not None:
             actions = actions.copy()
-            actions[..., self.gripper] = -np.sign(2 * actions[..., self.gripper] - 1)
+            actions[..., self.gripper] = gripper_command(actions[..., self.gripper])
         return actions if latest is None else actions + self._offset(latest)
 
     def _relative(self, actions: Float32Array, state: ArrayLike | None) -> Float32Array:

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 from saccade._internal.json import dumps
 from saccade._internal.small_files import read_json
 from saccade.errors import CheckpointError
+from saccade.policy.loading import returned_horizon
 from saccade.robots import LANGUAGE_KEY
 from saccade.robots.reading import processor_folder
 
@@ -75,7 +76,7 @@ def _of_policy(policy: Policy) -> Configs:
     """Configs made from what the policy knows; with a data config, those that it states."""
     needs, normalizer = policy.requirements, policy.normalizer
     seen, acted = needs.observation_indices, needs.action_indices
-    horizon = normalizer.action_horizon or policy.head.config.action_horizon
+    horizon = returned_horizon(policy.head, normalizer)
     keys = {
         "video": [camera.name for camera in needs.cameras or ()],
         "state": [group.key for group in normalizer.state_groups],

@@ -16,13 +16,8 @@ import saccade
 from saccade.errors import InputError
 from saccade.robots import LANGUAGE_KEY
 from saccade_lab.libero import demos, training
-from saccade_lab.libero.checkpoint import (
-    ACTION_GROUPS,
-    CAMERAS,
-    EMBODIMENT,
-    STATE_GROUPS,
-    policy_actions,
-)
+from saccade_lab.libero.checkpoint import CAMERAS, EMBODIMENT, policy_actions
+from saccade_lab.libero.layout import ACTION_GROUPS, STATE_GROUPS
 from saccade_lab.libero.policy import LiberoPolicy
 from saccade_lab.libero.recording import describe, is_recording, load_samples, read_recordings
 from saccade_lab.libero.sizes import libero_config
