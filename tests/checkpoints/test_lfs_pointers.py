@@ -12,8 +12,8 @@ import pytest
 import saccade
 from saccade.errors import CheckpointError
 from tests.helpers import layouts
+from tests.helpers.lfs_pointer import POINTER
 
-POINTER = f"version https://git-lfs.github.com/spec/v1\noid sha256:{'0' * 64}\nsize 15881149\n"
 SAYS = (
     "it is a Git LFS pointer, not the file itself: run `git lfs pull` in {folder}, or download the repository"
 )

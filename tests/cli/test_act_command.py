@@ -13,6 +13,7 @@ from PIL import Image
 
 from saccade import Policy, cli
 from saccade.cli import profiling
+from tests.helpers.lfs_pointer import POINTER
 from tests.helpers.whole_checkpoints import EMBODIMENT, HEIGHT, WIDTH, whole
 
 PARTS = ["load", "frames", "processor", "backbone", "encode", "sample"]
@@ -96,8 +97,9 @@ def test_it_prints_tables_and_says_what_it_assumed(capsys: pytest.CaptureFixture
             ["--image", "front={small}", "wrist={front}"],
             f"expected frames of {HEIGHT} x {WIDTH} pixels, got 3 x 2",
         ),
-        (["--state", "missing.json"], "missing.json: No such file"),
+        (["--state", "missing.json"], "missing.json: no such file"),
         (["--state", "{text}"], "cannot be read as JSON"),
+        (["--state", "{pointer}"], "pointer: cannot be read as JSON: it is a Git LFS pointer"),
         (["--state", "{words}"], "expected lists of numbers"),
         (["--state", "{short}"], r"state: expected 7 numbers (arm (5), hand (2)), got 1"),
         (["--state", "{part}"], "state.hand: expected hand too, got arm"),
@@ -112,8 +114,10 @@ def test_bad_input_is_one_line(
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    files = {name: tmp_path / name for name in ("text", "deep.png", "small.png", "words", "short", "part")}
+    names = ("text", "deep.png", "small.png", "words", "short", "part", "pointer")
+    files = {name: tmp_path / name for name in names}
     files["text"].write_text("no picture")
+    files["pointer"].write_text(POINTER)
     Image.fromarray(np.zeros((4, 4), np.uint16)).save(files["deep.png"])
     Image.fromarray(np.zeros((3, 2, 3), np.uint8)).save(files["small.png"])
     files["words"].write_text('{"arm": "high"}')

@@ -16,6 +16,7 @@ import pytest
 import saccade
 from saccade.cli import recorded
 from saccade.evaluation import certificate
+from tests.helpers.lfs_pointer import POINTER
 from tests.helpers.recorded_commands import DEMO, run
 
 OPTIONS = ("--stride", 8, "--num-threads", 1)
@@ -263,13 +264,27 @@ def test_a_damaged_certificate_is_named(
     assert f"{file}: expected a certificate" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("text", ["", "[]", "{}", '{"format": 3}', '{"format": 2, "mse": 3}', "null", "3"])
-def test_no_certificate_is_named(text: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "cannot be read as JSON"),
+        (POINTER, "cannot be read as JSON: it is a Git LFS pointer"),
+        ("[]", "expected a JSON object, got list"),
+        ("null", "expected a JSON object, got NoneType"),
+        ("{}", "expected a certificate"),
+        ('{"format": 3}', "expected a certificate"),
+        ('{"format": 2, "mse": 3}', "expected a certificate"),
+    ],
+)
+def test_no_certificate_is_named(
+    text: str, message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     file = tmp_path / "certificate.json"
     file.write_text(text)
     assert run("certify", file) == 2
-    assert "expected a certificate" in capsys.readouterr().err
+    assert f"{file}: {message}" in capsys.readouterr().err
     assert run("certify", tmp_path / "none.json") == 2
+    assert "none.json: no such file" in capsys.readouterr().err
 
 
 def test_a_certificate_has_one_policy_in_memory(

@@ -15,6 +15,7 @@ from saccade import cli
 from saccade._internal.flags import UsageError, add_num_threads, add_policy_options, policy_options
 from saccade.checkpoints import inspection
 from saccade_lab.sim import episodes, policy
+from tests.helpers.lfs_pointer import POINTER
 
 #: The flags, and what is passed on of them.
 FLAGS = [
@@ -73,9 +74,16 @@ def test_processor_options_are_json_or_a_file_of_it(tmp_path: Path) -> None:
         message = f"--processor-options: given {word!r:.100}, expected a JSON object or a file with one"
         with pytest.raises(UsageError, match="^" + re.escape(message)):
             options("--processor-options", word)
-    file.write_text("[1]")
-    with pytest.raises(UsageError, match=r"got a list\)$"):
-        options("--processor-options", str(file))
+    for text, problem in (
+        ("[1]", "got list"),
+        (POINTER, "it is a Git LFS pointer"),
+        ("[" * 100_000, "cannot be read"),
+    ):
+        file.write_text(text)
+        with pytest.raises(UsageError, match=rf"options.json: .*{problem}"):
+            options("--processor-options", str(file))
+    with pytest.raises(UsageError, match="expected a JSON object"):
+        options("--processor-options", '{"a": ' * 100_000)
 
 
 @pytest.mark.parametrize("command", ["act", "serve"])

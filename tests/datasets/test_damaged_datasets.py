@@ -22,6 +22,7 @@ from tests.helpers.dataset_damage import (
     dangling,
     edited,
     lines,
+    pipe,
     png,
     put,
     rewritten,
@@ -29,6 +30,7 @@ from tests.helpers.dataset_damage import (
     shorter_video,
     small_video,
 )
+from tests.helpers.lfs_pointer import POINTER
 
 
 @pytest.fixture(scope="module")
@@ -82,6 +84,12 @@ OPENING: list[tuple[str, Change, str]] = [
         "file-000.parquet: cannot be read as Parquet",
     ),
     ("v2.1", cut("meta/modality.json", 0.5), "modality.json: cannot be read as JSON"),
+    ("v2.1", pipe("meta/modality.json"), "modality.json: cannot be read as JSON: not a regular file"),
+    (
+        "v2.1",
+        lambda root: (root / "meta/modality.json").write_text(POINTER),
+        "modality.json: cannot be read as JSON: it is a Git LFS pointer",
+    ),
     (
         "v2.1",
         edited("meta/modality.json", lambda values: []),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -81,6 +82,16 @@ def dangling(name: str) -> Change:
     def apply(root: Path) -> None:
         (root / name).unlink(missing_ok=True)
         (root / name).symlink_to(root / "nothing")
+
+    return apply
+
+
+def pipe(name: str) -> Change:
+    """A pipe that nobody writes to, so that reading it would never end."""
+
+    def apply(root: Path) -> None:
+        (root / name).unlink()
+        os.mkfifo(root / name)
 
     return apply
 

@@ -24,6 +24,7 @@ from saccade.checkpoints import describe, quantize, read_tensors
 from saccade.errors import CheckpointError
 from tests.helpers import hostile_cases
 from tests.helpers.hostile_cases import TINY, WRITERS, limited, names, refused
+from tests.helpers.lfs_pointer import POINTER
 from tests.helpers.systems import IS_ROOT, linux, posix
 
 # Fixtures.
@@ -111,7 +112,6 @@ def holes(dtype: str, shape: list[int], nbytes: int) -> Callable[[Path], object]
 
 
 INDEX = "model.safetensors.index.json"
-POINTER = f"version https://git-lfs.github.com/spec/v1\noid sha256:{'0' * 64}\nsize 4967215360\n"
 # The head's names and shapes are compared before anything is read.
 TOO_LARGE = "cannot allocate|do not fit the config|disagree"
 SUM_OVERFLOWS = {

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 from saccade._internal.arrays import PRECISIONS
+from saccade._internal.small_files import read_json
 
 #: A parser, or a group of its arguments.
 Arguments: TypeAlias = argparse._ActionsContainer
@@ -300,16 +301,14 @@ def json_object(word: str) -> dict[str, Any]:
     Raises:
         UsageError: There is none.
     """
-    found: Any = None
     try:
-        found = json.loads(word if word.lstrip().startswith("{") else Path(word).read_text("utf-8"))
-        problem = f"got a {type(found).__name__}"
-    except (OSError, ValueError) as error:
-        problem = str(error)
-    if not isinstance(found, dict):
+        if not word.lstrip().startswith("{"):
+            return read_json(Path(word))
+        found: dict[str, Any] = json.loads(word)
+    except (OSError, ValueError, RecursionError) as error:
         raise UsageError(
-            f"--processor-options: given {word!r:.100}, expected a JSON object or a file with one ({problem})"
-        )
+            f"--processor-options: given {word!r:.100}, expected a JSON object or a file with one ({error})"
+        ) from None
     return found
 
 

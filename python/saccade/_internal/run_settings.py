@@ -9,6 +9,7 @@ from typing import Any
 
 from saccade._internal.files import write_json
 from saccade._internal.json import dumps
+from saccade._internal.small_files import read_json
 from saccade.errors import InputError
 
 
@@ -28,25 +29,10 @@ def begin(file: Path, settings: Mapping[str, Any], directory: Path) -> None:
     if not file.is_file():
         write_json(file, now)
         return
-    before = read(file)
+    before = read_json(file, InputError)
     names = [name for name in {**before, **now} if before.get(name) != now.get(name)]
     if names:
         raise InputError(
             f"{directory}: has results with other settings ({', '.join(names)} changed): "
             "choose another directory, or delete this one"
         )
-
-
-def read(file: Path) -> dict[str, Any]:
-    """The settings in a file.
-
-    Raises:
-        InputError: It is damaged.
-    """
-    try:
-        found = json.loads(file.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError) as error:
-        raise InputError(f"{file}: cannot be read as JSON: {error}") from None
-    if not isinstance(found, dict):
-        raise InputError(f"{file}: expected a JSON object, got {type(found).__name__}")
-    return found

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 import saccade._saccade as _saccade
-from saccade.errors import CheckpointError, printable
+from saccade.errors import CheckpointError, SaccadeError, printable
 
 #: A larger file is refused, since it is read at once. The engine has the same limit for its JSON files.
 MOST_BYTES = 100_000_000
@@ -33,22 +33,31 @@ DTYPES = {
 }
 
 
-def read_json(path: Path) -> dict[str, Any]:
+def read_json(path: Path, error: type[SaccadeError] = CheckpointError) -> dict[str, Any]:
     """Reads a JSON file that contains an object.
+
+    Args:
+        path: The file.
+        error: What is raised if the file is damaged.
 
     Raises:
         FileNotFoundError: The file does not exist.
-        CheckpointError: It contains something else.
+        error: It contains something else, or cannot be read.
     """
+    values = read_json_value(path, error)
+    if not isinstance(values, dict):
+        raise error(f"{path}: expected a JSON object, got {type(values).__name__}")
+    return values
+
+
+def read_json_value(path: Path, error: type[SaccadeError]) -> Any:
+    """Reads a JSON file, whatever value it contains. Arguments and errors as of :func:`read_json`."""
     try:
-        values = json.loads(read_small(path))
+        return json.loads(read_small(path))
     except FileNotFoundError:
         raise FileNotFoundError(printable(f"{path}: no such file")) from None
-    except (OSError, ValueError, RecursionError) as error:
-        raise CheckpointError(f"{path}: cannot be read as JSON: {error}") from None
-    if not isinstance(values, dict):
-        raise CheckpointError(f"{path}: expected a JSON object, got {type(values).__name__}")
-    return values
+    except (OSError, ValueError, RecursionError) as cause:
+        raise error(f"{path}: cannot be read as JSON: {cause}") from None
 
 
 def read_small_tensors(path: Path) -> dict[str, npt.NDArray[Any]]:

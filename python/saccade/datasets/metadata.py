@@ -16,7 +16,7 @@ from saccade._internal.small_files import read_json, read_small
 from saccade.datasets import parquet
 from saccade.datasets.features import Episode, Feature, Metadata, Statistics, VideoPart
 from saccade.datasets.statistics import aggregate
-from saccade.errors import CheckpointError, DatasetError
+from saccade.errors import DatasetError
 
 #: A place in a template of paths: ``{episode_index:06d}``, ``{video_key}``.
 PLACE = re.compile(r"\{([a-z_]+)(?::0([0-9]{1,2})d)?\}")
@@ -32,7 +32,7 @@ def read_metadata(root: Path) -> Metadata:
     if not root.is_dir():
         kind = NotADirectoryError if root.exists() else FileNotFoundError
         raise kind(f"{root}: no such directory; expected the folder of a LeRobotDataset, with meta/info.json")
-    info = _json(root / "meta" / "info.json")
+    info = read_json(root / "meta" / "info.json", DatasetError)
     return Info(root, info).metadata()
 
 
@@ -154,13 +154,6 @@ class Info:
                 there.add(file)
 
 
-def _json(path: Path) -> dict[str, Any]:
-    try:
-        return read_json(path)
-    except CheckpointError as error:
-        raise DatasetError(str(error)) from None
-
-
 def _json_lines(path: Path) -> list[dict[str, Any]]:
     """The objects of a JSON Lines file."""
     found = []
@@ -252,7 +245,7 @@ def _recorded(meta: Path) -> Statistics | None:
     path = meta / "stats.json"
     if not os.path.lexists(path):
         return None
-    values = _json(path)
+    values = read_json(path, DatasetError)
     try:
         return _arrays(values)
     except (AttributeError, TypeError, ValueError) as error:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from saccade._internal.extras import SACCADE
+from saccade._internal.small_files import read_json
 from saccade.datasets.dataset import Dataset
 from saccade.datasets.metadata import read_metadata
 from saccade.datasets.modality import plain, read_modality
@@ -63,17 +63,5 @@ def open(
     elif isinstance(given, Mapping):
         keys = read_modality(given, metadata.features, "modality")
     else:
-        keys = read_modality(_json(Path(given)), metadata.features, str(given))
+        keys = read_modality(read_json(Path(given), DatasetError), metadata.features, str(given))
     return Dataset(Stored(metadata), keys, read_selection(data_config, keys))
-
-
-def _json(path: Path) -> Mapping[str, Any]:
-    try:
-        values = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise FileNotFoundError(f"{path}: no such file") from None
-    except (OSError, ValueError, RecursionError) as error:
-        raise DatasetError(f"{path}: cannot be read as JSON: {error}") from None
-    if not isinstance(values, Mapping):
-        raise DatasetError(f"{path}: expected a JSON object, got {type(values).__name__}")
-    return values

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import hashlib
-import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -15,6 +14,7 @@ import numpy as np
 
 from saccade._internal.arrays import Float32Array
 from saccade._internal.environment import arithmetic, cpu_name
+from saccade._internal.small_files import read_json
 from saccade.errors import InputError
 from saccade.evaluation.prediction import noise_of
 from saccade.evaluation.recordings import Recordings, length_of, observation_at
@@ -86,15 +86,13 @@ class Certificate:
             FileNotFoundError: There is no such file.
             InputError: It is no certificate.
         """
+        values = read_json(path, InputError)
         try:
-            values = json.loads(path.read_text(encoding="utf-8"))
             if values.pop("format") != FORMAT:
                 raise InputError(f"{path}: expected a certificate of format {FORMAT}")
             found = cls(**values)
             found.check_types()
-        except FileNotFoundError:
-            raise
-        except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+        except (ValueError, KeyError, TypeError, AttributeError) as error:
             if isinstance(error, InputError):
                 raise
             raise InputError(

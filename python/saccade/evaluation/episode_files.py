@@ -64,7 +64,7 @@ class EpisodeFiles(Generic[Record]):
         file = self.folder / SETTINGS
         if not file.is_file():
             raise FileNotFoundError(f"{file}: no such file; expected the directory of an earlier run")
-        return run_settings.read(file)
+        return read_json(file, InputError)
 
     def write_names(self, names: Mapping[str, str]) -> None:
         """Keeps what readers call the checkpoint and the recordings, which may change between two runs."""
@@ -74,10 +74,10 @@ class EpisodeFiles(Generic[Record]):
         """What readers call them; empty if that was not kept.
 
         Raises:
-            CheckpointError, InputError: The file is damaged.
+            InputError: The file is damaged.
         """
         file = self.folder / NAMES
-        found = read_json(file) if file.is_file() else {}
+        found = read_json(file, InputError) if file.is_file() else {}
         if not all(isinstance(name, str) for name in found.values()):
             raise InputError(f"{file}: expected an object of texts, got {found!r:.60}")
         return found

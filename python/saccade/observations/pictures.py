@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import re
 from collections.abc import Mapping
@@ -13,6 +12,7 @@ from typing import Any, Protocol, cast
 import numpy as np
 
 from saccade._internal.arrays import UInt8Array
+from saccade._internal.small_files import read_json_value
 from saccade.errors import InputError, SaccadeError
 from saccade.observations.formats import read
 from saccade.observations.requirements import Requirements
@@ -228,11 +228,13 @@ def instruction_of(given: Mapping[str, Any]) -> str:
 
 
 def read_state(path: Path) -> Any:
-    """The state in a JSON file: numbers by key, ``{"arm": [0, 0.1], "hand": [1]}``, or one list of all."""
-    try:
-        values = json.loads(path.read_text(encoding="utf-8"))
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"{path}: cannot be read as JSON: {error}") from None
+    """The state in a JSON file: numbers by key, ``{"arm": [0, 0.1], "hand": [1]}``, or one list of all.
+
+    Raises:
+        FileNotFoundError: The file does not exist.
+        InputError: It contains something else, or cannot be read.
+    """
+    values = read_json_value(path, InputError)
     rows = list(values.values()) if isinstance(values, dict) else [values]
     if not rows or not all(_is_numbers(row) for row in rows):
         raise InputError(f"{path}: expected lists of numbers by key, or one list of numbers")
