@@ -6,11 +6,11 @@ and ``<suite>-<task>/recording.json``, which has the settings.
 
 from __future__ import annotations
 
-import json
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from saccade._internal.small_files import read_json
 from saccade.errors import InputError
 from saccade.processor import Processor
 from saccade_lab.libero.checkpoint import policy_actions
@@ -51,8 +51,12 @@ class LiberoRecording:
 
 
 def is_recording(directory: Path) -> bool:
-    """Whether a directory has demonstrations of LIBERO."""
-    return any("suite" in json.loads(path.read_text()) for path in directory.glob(f"*/{SETTINGS_FILE}"))
+    """Whether a directory has demonstrations of LIBERO.
+
+    Raises:
+        InputError: A file with settings is damaged.
+    """
+    return any("suite" in read_json(path, InputError) for path in directory.glob(f"*/{SETTINGS_FILE}"))
 
 
 def read_recordings(directory: Path) -> list[LiberoRecording]:
@@ -60,11 +64,12 @@ def read_recordings(directory: Path) -> list[LiberoRecording]:
 
     Raises:
         FileNotFoundError: There are none.
-        InputError: They differ in their suite, their frames or how many there are, or are not of LIBERO.
+        InputError: They differ in their suite, their frames or how many there are, are not of LIBERO, or a
+            file is damaged.
     """
     found = []
     for path in directory.glob(f"*/{SETTINGS_FILE}"):
-        values = json.loads(path.read_text())
+        values = read_json(path, InputError)
         if set(values) != set(LiberoRecording.__dataclass_fields__):
             raise InputError(f"{path}: expected a recording of LIBERO, got the settings {', '.join(values)}")
         found.append(LiberoRecording(**values))

@@ -11,7 +11,6 @@ from __future__ import annotations
 import functools
 import io
 import itertools
-import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -20,8 +19,10 @@ from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
+from saccade._internal import run_settings
 from saccade._internal.arrays import Float32Array
-from saccade._internal.files import write_atomically, write_json
+from saccade._internal.files import write_atomically
+from saccade._internal.small_files import read_json
 from saccade.errors import InputError, SaccadeError
 from saccade_lab.parallel import ALONE, Lost, Workers, each
 from saccade_lab.sim import environment_cache
@@ -297,7 +298,8 @@ def record_with(
     tasks = {task: Seeds(task, count, out / task) for task, count in counts.items()}
     for task in tasks.values():
         task.directory.mkdir(parents=True, exist_ok=True)
-        claim_directory(task.directory / "recording.json", settings[task.task])
+        file = task.directory / "recording.json"
+        run_settings.begin(file, settings[task.task].to_dict(), task.directory)
     lost = []
     try:
         # Failures of the experts are known only after a round; the next one makes up for them.
@@ -332,18 +334,6 @@ def record_task(
     record_tasks({task: count}, out, settings, lambda task: on_episode())
 
 
-def claim_directory(path: Path, settings: Settings) -> None:
-    """Writes the settings, or checks that they are those of an earlier recording.
-
-    Raises:
-        InputError: The directory contains a recording with other settings.
-    """
-    if not path.exists():
-        write_json(path, settings.to_dict())
-    elif json.loads(path.read_text()) != json.loads(json.dumps(settings.to_dict())):
-        raise InputError(f"{path.parent}: was recorded with other settings; use another directory")
-
-
 def load(path: Path, *, images: bool = True) -> Demonstration:
     """Reads one episode, with or without its images. Without, ``images`` is ``(frames, 0, 0, 0, 3)``."""
     with np.load(path, allow_pickle=False) as arrays:  # reads an array when it is asked for
@@ -368,12 +358,17 @@ def read_settings(directory: Path, tasks: Sequence[str]) -> RecordingSettings:
     """The settings that all tasks of a recording share.
 
     Raises:
-        InputError: They differ.
+        FileNotFoundError: A task has no recording.
+        InputError: They differ, or a file is damaged.
     """
-    found = [json.loads((directory / name / "recording.json").read_text()) for name in tasks]
+    files = [directory / name / "recording.json" for name in tasks]
+    found = [read_json(file, InputError) for file in files]
     if any(settings != found[0] for settings in found):
         raise InputError(f"{directory}: the tasks were recorded with different settings")
-    return RecordingSettings.from_dict(found[0])
+    try:
+        return RecordingSettings.from_dict(found[0])
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(f"{files[0]}: settings of an unknown form ({error!r})") from None
 
 
 def export(directory: Path, counts: Mapping[str, int], path: Path) -> None:

@@ -28,6 +28,7 @@ from safetensors.torch import save as serialize
 from torch import Tensor
 
 from saccade._internal.files import sha256_of, write_atomically, write_json
+from saccade._internal.small_files import read_json
 from saccade.errors import InputError
 from saccade_lab.files import changed
 from saccade_lab.sim import demos
@@ -279,10 +280,11 @@ def config_of_start(config: PolicyConfig, policy: Path, only: str = "") -> Polic
 
     Raises:
         FileNotFoundError: There is no policy.
+        CheckpointError: A file of the policy is damaged.
         InputError: The policy has other sizes, tasks or cameras. The head may have other sizes where it alone
             is trained.
     """
-    found, statistics = (json.loads((policy / name).read_text()) for name in (CONFIG_FILE, METADATA_FILE))
+    found, statistics = (read_json(policy / name) for name in (CONFIG_FILE, METADATA_FILE))
     expected = described(config)[0]
     if only == "head":
         found, expected = (

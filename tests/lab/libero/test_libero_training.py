@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import re
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -285,11 +287,23 @@ def test_recordings_that_do_not_fit_are_refused(recording: Path, tmp_path: Path)
         path.write_text(json.dumps({**values, **changed}))
         with pytest.raises(InputError, match="different settings"):
             read_recordings(other)
-    with pytest.raises(InputError, match="other settings"):  # nor are episodes of another expert added
-        sim_demos.claim_directory(path, tasks[1])
+
+    def record() -> None:
+        sim_demos.record_with(never, {tasks[1].name: tasks[1]}, {tasks[1].name: 1}, other, never)
+
+    with pytest.raises(InputError, match=r"other settings \(expert changed\)"):  # nor are others added to it
+        record()
     path.write_text(json.dumps({"cameras": [], "image_size": 68, "frame_stride": 3}))
     with pytest.raises(InputError, match="expected a recording of LIBERO"):
         read_recordings(other)
+    path.write_text(json.dumps(values)[:-9])
+    for read in (lambda: is_recording(other), lambda: read_recordings(other), record):
+        with pytest.raises(InputError, match=rf"^{re.escape(str(path))}: cannot be read as JSON: .*\Z"):
+            read()
+
+
+def never(given: Any) -> Any:
+    raise AssertionError(f"recorded {given}")
 
 
 @pytest.mark.parametrize(

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -92,8 +94,33 @@ def test_what_was_recorded_earlier_counts_for_the_expert(tmp_path: Path) -> None
 
 def test_recording_with_other_settings_is_refused(recording: Path) -> None:
     other = demos.RecordingSettings(image_size=24, cameras=RECORDING.cameras)
-    with pytest.raises(InputError, match="other settings"):
+    with pytest.raises(
+        InputError, match=r"reach: has results with other settings \(image_size, frame_stride changed\)"
+    ):
         demos.record_task("reach", 3, recording, other, lambda: None)
+
+
+@pytest.mark.parametrize(
+    ("damage", "problem"),
+    [
+        (lambda text: text[:-9], "cannot be read as JSON"),
+        (lambda text: "[]", "expected a JSON object, got list"),
+        (lambda text: "{}", "settings of an unknown form"),
+    ],
+)
+def test_damaged_settings_are_named(
+    damage: Callable[[str], str], problem: str, recording: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "recording"
+    shutil.copytree(recording, out)
+    for task in TASKS:
+        path = out / task / "recording.json"
+        path.write_text(damage(path.read_text()))
+    first = out / TASKS[0] / "recording.json"
+    with pytest.raises(InputError, match=rf"^{re.escape(str(first))}: {problem}.*\Z"):
+        demos.read_settings(out, TASKS)
+    with pytest.raises(InputError, match=re.escape(str(first.parent))):
+        demos.record_task(TASKS[0], 2, out, RECORDING, lambda: None)
 
 
 def test_chunks_stop_counting_after_a_disturbance_and_at_the_end() -> None:

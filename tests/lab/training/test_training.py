@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
-from saccade import InputError
+from saccade import CheckpointError, InputError
 from saccade.backbone.inputs import BackboneInputs
 from saccade_lab.reference.backbone import PreparedInputs
 from saccade_lab.sim.policy import DEMO_CHECKPOINT, Policy
@@ -209,6 +210,11 @@ def test_a_policy_of_other_sizes_cannot_be_started_from(recording: Path, tmp_pat
         train.train(recording, tmp_path / "out", TINY, ignore, start=DEMO_CHECKPOINT)
     with pytest.raises(FileNotFoundError):
         train.train(recording, tmp_path / "out", TINY, ignore, start=tmp_path / "nowhere")
+    start = tmp_path / "start"
+    shutil.copytree(DEMO_CHECKPOINT, start)
+    (start / "config.json").write_text("{")
+    with pytest.raises(CheckpointError, match=r"start/config.json: cannot be read as JSON"):
+        train.train(recording, tmp_path / "out", TINY, ignore, start=start)
     assert not (tmp_path / "out").exists()
 
 
