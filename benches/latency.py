@@ -33,6 +33,7 @@ from typing import Any
 import numpy as np
 
 import saccade
+from benches.files import write_text
 from benches.latency_contenders import Contenders, checkpoint, note, timed
 from benches.peers import inputs, machine
 from benches.peers.cases import Case
@@ -337,9 +338,7 @@ def main() -> None:
     for section in args.sections:
         measured = measures[section](args, report.get(section, {}))
         report |= {section: measured, "machine": machine.describe()}
-        part = results.with_suffix(".part")
-        part.write_text(json.dumps(report))
-        part.rename(results)
+        write_text(results, json.dumps(report))
     if not report:
         raise SystemExit(f"latency: {results} does not exist yet; run a section first")
     described = report["machine"]

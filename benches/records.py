@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import saccade
+from benches.files import write_record
 from benches.pages.report import require_commit
 from benches.peers import machine
 
@@ -64,7 +65,7 @@ def main() -> int:
     RESULTS.mkdir(exist_ok=True)
     for name in COMMANDS:
         path = RESULTS / f"{name}.json"
-        path.write_text(json.dumps({"machine": here, **record(name)}, indent=1) + "\n")
+        write_record(path, {"machine": here, **record(name)})
         print(path, flush=True)
     return 0
 

@@ -26,8 +26,11 @@ from typing import Any
 from benches import checkpoints
 from benches.backbone import accuracy, memory, report, reuse, setup
 from benches.backbone.contenders import GROUPS, Task, contenders, note, round_of
+from benches.files import write_record
 from benches.pages.report import report as write_report
 from benches.peers import machine
+from saccade._internal.small_files import read_json
+from saccade.errors import InputError
 
 SECTIONS = ("speed", "reuse", "memory", "accuracy")
 PRECISIONS = ("float32", "bfloat16", "int8")
@@ -43,14 +46,14 @@ def main(arguments: list[str] | None = None) -> int:
         return write_report(
             path, report.COMMITTED, report.PAGE, report.document, program="benches.backbone", write=args.write
         )
-    results: Results = json.loads(path.read_text()) if path.exists() else {}
+    results: Results = read_json(path, InputError) if path.exists() else {}
     results["machine"] = machine.describe()
     results["machine"]["versions"]["transformers"] = machine.version("transformers")
     args.work.mkdir(parents=True, exist_ok=True)
     for section in args.sections:
         measured = {"speed": speed, "reuse": reuse_section, "memory": memory_section, "accuracy": errors}
         results[section] = measured[section](args)
-        path.write_text(json.dumps(results, indent=1) + "\n")
+        write_record(path, results)
     print(report.document(results))
     return 0
 

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+from benches.files import write_record, write_text
 from benches.peers.results import rounded
 
 
@@ -74,7 +75,7 @@ def report(
         print(text)
         return 0
     require_commit(results, measured)
-    kept.write_text(json.dumps(rounded(results), indent=1) + "\n")
-    page.write_text(text)
+    write_record(kept, rounded(results))
+    write_text(page, text)
     print(page)
     return 0

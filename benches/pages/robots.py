@@ -23,6 +23,7 @@ from typing import Any
 import numpy as np
 
 import saccade
+from benches.files import write_text
 from saccade.robots import RELEASED, DataConfig
 from saccade.robots.embodiments import N15_IDS, N16_IDS, N17_IDS, N17_NAMES
 
@@ -406,7 +407,7 @@ def main() -> int:
         is_new = text == PAGE.read_text(encoding="utf-8")
         print(f"{PAGE.name}: {'up to date' if is_new else 'stale: run python -m benches.pages.robots'}")
         return int(not is_new)
-    PAGE.write_text(text, encoding="utf-8")
+    write_text(PAGE, text)
     return 0
 
 

@@ -6,6 +6,7 @@ import argparse
 from collections.abc import Iterator
 from pathlib import Path
 
+from benches.files import write_text
 from benches.pages.report import require_commit
 from benches.peers import results as kept
 from benches.peers.cases import RELEASES, Case
@@ -53,7 +54,7 @@ def command(results: Results, args: argparse.Namespace) -> int:
         measured = recorded(args.record)
         for each in measured:
             require_commit(each.data, each.path)
-        PAGE.write_text(page(measured))
+        write_text(PAGE, page(measured))
         print(PAGE)
         return 0
     if not results.data["machine"]:
@@ -68,7 +69,7 @@ def command(results: Results, args: argparse.Namespace) -> int:
 def write(results: Results, folder: Path) -> None:
     """Writes `policy-report-RELEASE.md` into the folder of the JSON file."""
     path = folder / f"policy-report-{release_of(results)}.md"
-    path.write_text(joined([f"# The whole policy, {title(results)}", *of_run(results), notes()]))
+    write_text(path, joined([f"# The whole policy, {title(results)}", *of_run(results), notes()]))
     print(path)
 
 

@@ -6,6 +6,7 @@ import argparse
 import re
 from pathlib import Path
 
+from benches.files import write_text
 from benches.pages.report import require_commit
 from benches.peers.cases import LINEAR_SHAPES, Case, exact_macs
 from benches.peers.contenders import CONTENDERS
@@ -58,7 +59,7 @@ def command(results: Results, args: argparse.Namespace) -> int:
         measured = records(args.record)
         for each in measured:
             require_commit(each.data, each.path)
-        PAGE.write_text(page(measured))
+        write_text(PAGE, page(measured))
         for each in measured:
             write_figures(each, IMAGES)
         return 0
@@ -71,7 +72,7 @@ def command(results: Results, args: argparse.Namespace) -> int:
 def write(results: Results, folder: Path) -> None:
     """Writes `report.md` and its figures into the folder of the JSON file."""
     write_figures(results, folder)
-    (folder / "report.md").write_text(document(results))
+    write_text(folder / "report.md", document(results))
     print(folder / "report.md")
 
 

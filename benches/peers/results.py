@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from benches.files import write_record
 from benches.peers.cases import Case
 from saccade_lab.timing import quartiles
 
@@ -51,12 +52,10 @@ class Results:
         return other
 
     def save(self, path: Path | None = None) -> None:
-        """Writes the file, or a copy to `path`, under a temporary name, then renames it."""
+        """Writes the file, or a copy to `path`."""
         path = path or self.path
         path.parent.mkdir(parents=True, exist_ok=True)
-        part = path.with_name(path.name + ".part")
-        part.write_text(json.dumps(rounded(self.data), indent=1) + "\n")
-        part.replace(path)
+        write_record(path, rounded(self.data))
 
     @property
     def cpu(self) -> str:

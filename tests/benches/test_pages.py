@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import re
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from benches import unchanged_views
+from benches.backbone import report as backbone
+from benches.files import write_record
 from benches.pages.report import UncommittedError, report, require_commit
 from benches.peers import __main__ as peers
 from benches.peers.results import RECORDS, Results
@@ -32,6 +36,27 @@ def test_a_record_of_a_tree_with_uncommitted_changes_is_refused(tmp_path: Path) 
     assert not kept.exists()
     assert written({"demo": DIRTY["demo"]}, True) == 0
     assert page.exists()
+
+
+def test_what_is_measured_is_written_whole_and_as_the_committed_records_are(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for path in (RECORDS / "zen-5.json", RESULTS / "parity.json", backbone.COMMITTED):
+        committed, copy = path.read_bytes(), tmp_path / path.name
+        write_record(copy, json.loads(committed))
+        assert copy.read_bytes() == committed
+        with monkeypatch.context() as patch:
+            patch.setattr(Path, "write_text", half_of_it)
+            with pytest.raises(OSError, match=re.escape(str(copy))):
+                write_record(copy, {"machine": {}})
+        assert copy.read_bytes() == committed
+    assert len(list(tmp_path.iterdir())) == 3
+
+
+def half_of_it(path: Path, text: str, encoding: str) -> None:
+    """Writes as on a disk that becomes full."""
+    path.write_bytes(text.encode(encoding)[: len(text) // 2])
+    raise OSError(errno.ENOSPC, "No space left on device")
 
 
 @pytest.mark.parametrize("version", [{"commit": "4567def-dirty"}, {"saccade": "0.1.0+g4567def.changed"}])
