@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +26,26 @@ VALUES: st.SearchStrategy[Any] = st.recursive(
     lambda inner: st.lists(inner, max_size=3) | st.dictionaries(KEYS, inner, max_size=4),
     max_leaves=25,
 )
+
+
+def requirements_of_n17(folder: Path, modality: str, config: dict[str, Any]) -> Requirements:
+    configs = {"video": {"modality_keys": ["front"]}, modality: config}
+    values = {"processor_kwargs": {"modality_configs": {"robot": configs}}}
+    (folder / "processor_config.json").write_text(json.dumps(values))
+    return read_requirements(folder, Robot("robot", None, (), (), 1, 1))
+
+
+@pytest.mark.parametrize("modality", ["video", "state", "action"])
+def test_steps_that_are_no_integers_are_named(modality: str, tmp_path: Path) -> None:
+    given = requirements_of_n17(tmp_path, modality, {"delta_indices": [-3, 0]})
+    assert getattr(given, f"{modality}_indices") == (-3, 0)
+    assert getattr(requirements_of_n17(tmp_path, modality, {}), f"{modality}_indices") is None
+    for steps in (None, "-3 0", 2, {}, [0, "1"], [0.0], [True], [[0]]):
+        message = (
+            rf"processor_config.json: robot: {modality}: delta_indices: expected a list of integers, got "
+        )
+        with pytest.raises(CheckpointError, match=message + re.escape(repr(steps))):
+            requirements_of_n17(tmp_path, modality, {"delta_indices": steps})
 
 
 @pytest.mark.parametrize("name", FILES)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import importlib.util
 import shutil
 import sys
@@ -17,6 +18,7 @@ import torch
 
 import saccade
 from saccade import Normalizer
+from saccade.observations import read_requirements
 from tests.helpers import layout_files
 from tests.helpers.normalizer_cases import as_array, draw, edit, step_config
 from tests.helpers.paths import DATA
@@ -191,6 +193,29 @@ def test_null_fields_of_an_action_config_are_absolute(tmp_path: Path) -> None:
     edit(folder / "policy_postprocessor.json", change)
     found, chunk = Normalizer.from_pretrained(folder), draw(2, 40, 132)
     assert np.array_equal(as_array(found.actions(chunk)), as_array(plain.actions(chunk)))
+
+
+@pytest.mark.parametrize("steps", [[0, 2, 4], None, "0 2 4", [0, 0.5]])
+def test_the_steps_of_the_actions_are_integers_or_not_a_list_as_in_lerobot(
+    steps: Any, tmp_path: Path
+) -> None:
+    folder = case("n17-native-keys", tmp_path)
+
+    def change(values: dict[str, Any]) -> None:
+        values["steps"][0]["config"]["modality_config"]["action"]["delta_indices"] = steps
+
+    plain = Normalizer.from_pretrained(folder)
+    edit(folder / "policy_postprocessor.json", change)
+    if steps == [0, 0.5]:
+        with pytest.raises(saccade.CheckpointError, match="delta_indices, a list of integers, got"):
+            Normalizer.from_pretrained(folder)
+        with pytest.raises(
+            saccade.CheckpointError, match=r"policy_postprocessor.json: action: delta_indices: "
+        ):
+            read_requirements(folder, dataclasses.replace(plain, pipeline=None))
+        return
+    found = read_requirements(folder, Normalizer.from_pretrained(folder))
+    assert found.action_indices == ((0, 2, 4) if isinstance(steps, list) else None)
 
 
 @pytest.mark.parametrize("mapping", [{"new_embodiment": "7"}, [1], {"new_embodiment": -2}])

@@ -12,8 +12,8 @@ from saccade.errors import CheckpointError
 from saccade.observations.lerobot import IMAGE, IMAGES
 from saccade.observations.requirements import Camera, Requirements
 from saccade.robots import Robot
-from saccade.robots.building import size_of, value_at
-from saccade.robots.lerobot_pipeline import PREPROCESSOR, read_pipeline
+from saccade.robots.building import is_list_of, size_of
+from saccade.robots.lerobot_pipeline import POSTPROCESSOR, PREPROCESSOR, action_steps, read_pipeline
 from saccade.robots.libero import CAMERA_ALIASES
 from saccade.robots.reading import processor_folder, processor_version
 
@@ -75,7 +75,9 @@ def _lerobot(folder: Path, values: Mapping[str, Any], robot: Robot) -> Requireme
         language_keys=(pack.get("language_key") or "task",),
         takes_extra_cameras=not ordered,
         rename_map=tuple(pipeline.rename_map.items()),
-        action_indices=_steps(value_at(pipeline.unpack.config, "modality_config", "action")),
+        action_indices=_steps(
+            folder / POSTPROCESSOR, "action", action_steps(pipeline.unpack.config.get("modality_config"))
+        ),
     )
 
 
@@ -109,13 +111,17 @@ def _processor(folder: Path, values: Mapping[str, Any], robot: Robot) -> Require
             f"{folder}: {robot.embodiment}: expected one language key, as the released N1.6 does, got "
             f"{', '.join(keys)}"
         )
-    steps = video.get("delta_indices") or []
+    where = processor_folder(folder) / "processor_config.json"
+    steps = {
+        kind: _steps(where, f"{robot.embodiment}: {kind}", (about.get(kind) or {}).get("delta_indices", []))
+        for kind in ("video", "state", "action")
+    }
     return Requirements(
         cameras=tuple(Camera(name) for name in cameras) or None,
-        video_horizon=len(steps) or None,
-        video_indices=_steps(about.get("video")),
-        state_indices=_steps(about.get("state")),
-        action_indices=_steps(about.get("action")),
+        video_horizon=len(steps["video"] or ()) or None,
+        video_indices=steps["video"],
+        state_indices=steps["state"],
+        action_indices=steps["action"],
         language_keys=tuple(keys),
         requires_language=True,
     )
@@ -145,16 +151,21 @@ def _metadata(folder: Path, values: Mapping[str, Any], robot: Robot) -> Requirem
     )
 
 
-def _steps(config: Any) -> tuple[int, ...] | None:
-    """The ``delta_indices`` of a modality, if they are integers."""
-    steps = (config or {}).get("delta_indices")
-    if not isinstance(steps, list) or not steps or not all(type(step) is int for step in steps):
-        return None
-    return tuple(steps)
+def _steps(where: Path, modality: str, given: Any) -> tuple[int, ...] | None:
+    """The ``delta_indices`` of a modality; None if there are none.
+
+    Raises:
+        CheckpointError: They are not a list of integers.
+    """
+    if not is_list_of(int, given):
+        raise CheckpointError(
+            f"{where}: {modality}: delta_indices: expected a list of integers, got {given!r:.60}"
+        )
+    return tuple(given) or None
 
 
 def _names(given: Any) -> list[str]:
-    if not isinstance(given, list) or not all(isinstance(name, str) for name in given):
+    if not is_list_of(str, given):
         raise ValueError(f"expected names, got {given!r}")
     return given
 

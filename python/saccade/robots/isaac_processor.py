@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from saccade.errors import CheckpointError
-from saccade.robots.building import Builder, Options, value_at, width_of
+from saccade.robots.building import Builder, Options, is_list_of, value_at, width_of
 from saccade.robots.embodiments import IDS, choose
 from saccade.robots.groups import Group, Reference
 from saccade.robots.lerobot_pipeline import KNOWN, action_steps
@@ -163,18 +163,18 @@ def modality(builder: Builder, config: Any, kind: str, relative: bool) -> Modali
     """
     found = value_at(config, kind)
     keys = value_at(found, "modality_keys")
-    if not isinstance(keys, list) or not keys or not all(isinstance(key, str) for key in keys):
+    if not is_list_of(str, keys) or not keys:
         raise CheckpointError(f"{builder.where}: {kind}: no modality_keys")
     if len(set(keys)) != len(keys):
         builder.problems.append(f"{kind}: expected distinct modality_keys, got {', '.join(keys)}")
     steps = found.get("delta_indices")
-    if not isinstance(steps, list) or not steps or not all(type(step) is int for step in steps):
+    if not is_list_of(int, steps) or not steps:
         builder.problems.append(f"{kind}: expected delta_indices, a list of integers, got {steps!r:.60}")
         steps = [0]
     chosen = []
     for name in ("sin_cos_embedding_keys", "mean_std_embedding_keys"):
         names = found.get(name) or []
-        if not isinstance(names, list) or not all(isinstance(key, str) for key in names):
+        if not is_list_of(str, names):
             builder.problems.append(f"{kind}: {name}: expected a list of keys, got {names!r:.60}")
             names = []
         chosen.append(tuple(names))

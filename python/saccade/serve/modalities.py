@@ -14,6 +14,7 @@ from saccade._internal.small_files import read_json
 from saccade.errors import CheckpointError
 from saccade.policy.loading import returned_horizon
 from saccade.robots import LANGUAGE_KEY
+from saccade.robots.building import is_list_of
 from saccade.robots.reading import processor_folder
 
 if TYPE_CHECKING:
@@ -65,7 +66,7 @@ def _of_checkpoint(policy: Policy) -> Configs | None:
         for config in found.values():
             for field, kind in (("delta_indices", int), ("modality_keys", str)):
                 given = config[field]
-                if not isinstance(given, list) or not all(type(value) is kind for value in given):
+                if not is_list_of(kind, given):
                     raise ValueError(f"expected a list of {kind.__name__}, got {given!r:.100}")
     except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise CheckpointError(f"{path}: modality_configs of an unknown form ({error!r})") from error
