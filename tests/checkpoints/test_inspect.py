@@ -129,18 +129,6 @@ def test_which_embodiments_look_trained(base: Path) -> None:
     np.testing.assert_allclose(scores, expected, rtol=1e-9, atol=1e-9)
 
 
-def test_names_that_a_checkpoint_brings_come_first(tmp_path: Path) -> None:
-    folder = layouts.write(tmp_path / "n17", "n17")
-    names = [entry.names for entry in inspect(folder).embodiments]
-    assert names[2] == ["libero_sim"]
-    assert names[10] == ["new_embodiment"]
-    assert names[31] == []
-    for text in ("[]", '{"a": "b", "c": [1]}', "{", '{"x": 7}'):
-        (folder / "embodiment_id.json").write_text(text)
-        names = [entry.names for entry in inspect(folder).embodiments]
-    assert names[7] == ["x"]
-
-
 def test_robust_z_of_equal_numbers_is_none() -> None:
     assert robust_z(np.zeros(5)) is None
 

@@ -5,11 +5,9 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 from saccade._internal.arrays import PRECISIONS
 from saccade._internal.hub import resolve
-from saccade._internal.small_files import read_json
 from saccade.checkpoints.description import (
     CALIBRATION,
     Config,
@@ -23,10 +21,11 @@ from saccade.checkpoints.findings import Counts, Inspection, Memory
 from saccade.checkpoints.resemblance import Reference
 from saccade.checkpoints.survey import Survey, token_statistics
 from saccade.checkpoints.whole import backbone_of, robots_of
-from saccade.errors import CheckpointError, InputError, SaccadeError
+from saccade.errors import CheckpointError, InputError
 from saccade.head.config import to_json
 from saccade.robots import DataConfigLike
 from saccade.robots.embodiments import IDS
+from saccade.robots.reading import embodiment_ids
 
 
 def inspect(
@@ -56,7 +55,7 @@ def inspect(
 
     Raises:
         FileNotFoundError, CheckpointError: As :meth:`saccade.ActionHead.from_pretrained`, except that values
-            need not be finite.
+            need not be finite. Or a file with the ids of embodiments is damaged.
         InputError: ``reference`` is of another version.
 
     Example:
@@ -78,10 +77,10 @@ def inspect(
             f"{head.version.upper()}, the version of source"
         )
     path = resolve(source)
-    outside = _outside(description)
+    outside, names = _outside(description), _embodiment_names(description)
     survey = Survey(published, head, None if other is None else other.compare, progress)
     parts = survey.parts()
-    embodiments = survey.embodiments(_embodiment_names(description))
+    embodiments = survey.embodiments(names)
     tokens = None
     if survey.tokens is not None and len(survey.tokens) > 0:
         tokens = token_statistics(survey.tokens, head.future_key_bias)
@@ -144,23 +143,6 @@ def _embodiment_names(description: Description) -> dict[int, list[str]]:
     first = description.files[0].path if description.files else path
     folder = path if path.is_dir() else Path(first).parent
     names: dict[int, list[str]] = {}
-    for name, index in (_mapping(folder) or IDS[description.version]).items():
+    for name, index in (embodiment_ids(folder) or IDS[description.version]).items():
         names.setdefault(index, []).append(name)
     return names
-
-
-def _mapping(folder: Path) -> dict[str, int]:
-    """Ids by name in `embodiment_id.json` or in lerobot's processors; empty if there are none."""
-    for name in ("embodiment_id.json", "policy_preprocessor.json"):
-        try:
-            values: Any = read_json(folder / name)
-        except (OSError, SaccadeError):
-            continue
-        if name == "policy_preprocessor.json":
-            steps = values.get("steps")
-            configs = [step.get("config") for step in steps or () if isinstance(step, dict)]
-            mappings = [config.get("embodiment_mapping") for config in configs if isinstance(config, dict)]
-            values = next(filter(None, mappings), {})
-        if isinstance(values, dict):
-            return {tag: index for tag, index in values.items() if isinstance(index, int)}
-    return {}

@@ -58,10 +58,10 @@ def processor_robot(
     version: str | None,
     kwargs: Mapping[str, Any],
     statistics: Mapping[str, Any],
-    ids: Mapping[str, Any],
+    ids: Mapping[str, int],
     options: Options,
 ) -> Robot:
-    """The robot of ``processor_kwargs``, ``statistics.json`` and ``embodiment_id.json``.
+    """The robot of ``processor_kwargs``, ``statistics.json`` and the checked ids of ``embodiment_id.json``.
 
     The released table of the version, if that is known, adds ids of tags that the file lacks.
     """
@@ -69,7 +69,7 @@ def processor_robot(
     configs = kwargs.get("modality_configs")
     if not isinstance(configs, Mapping) or not configs:
         raise CheckpointError(f"{where}: no modality_configs")
-    known = {**IDS.get(version or "", {}), **checked_ids(where, ids)}
+    known = {**IDS.get(version or "", {}), **ids}
     tags = [tag for tag in configs if tag in statistics]
     if not tags:
         raise CheckpointError(

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from saccade._internal.small_files import read_json
 from saccade.robots.building import Builder, Options, bounded_size, size_of, value_at, width_of
 from saccade.robots.embodiments import LEROBOT_N15_IDS, N17_IDS
 from saccade.robots.groups import Group
@@ -25,7 +26,7 @@ from saccade.robots.isaac_processor import (
     modality,
     refuse_unknown_fields,
 )
-from saccade.robots.lerobot_pipeline import DECODE, Pipeline, action_steps, read_pipeline
+from saccade.robots.lerobot_pipeline import DECODE, PREPROCESSOR, Pipeline, action_steps, read_pipeline
 from saccade.robots.libero import TAG as LIBERO_TAG
 from saccade.robots.robot import Robot, finished
 from saccade.robots.rotations import POSES
@@ -85,6 +86,21 @@ def lerobot_robot(folder: Path, preprocessor: Mapping[str, Any], options: Option
         gripper=gripper,
         pipeline=pipeline,
     )
+
+
+def pipeline_ids(folder: Path) -> dict[str, int]:
+    """Ids by tag that a step of a checkpoint's preprocessor says; empty if none does.
+
+    Raises:
+        CheckpointError: The file is damaged.
+    """
+    path = folder / PREPROCESSOR
+    steps = read_json(path).get("steps") if path.is_file() else None
+    for step in steps if isinstance(steps, list) else ():
+        given = value_at(step, "config", "embodiment_mapping")
+        if given is not None:
+            return checked_ids(str(path), given)
+    return {}
 
 
 def _state_groups(builder: Builder, pipeline: Pipeline) -> tuple[Group, ...]:

@@ -19,8 +19,8 @@ from saccade.robots.building import Builder, Options, size_of, value_at
 from saccade.robots.data_configs import data_config
 from saccade.robots.embodiments import N15_IDS
 from saccade.robots.isaac_metadata import metadata_robot
-from saccade.robots.isaac_processor import CLASSES, processor_robot
-from saccade.robots.lerobot import lerobot_robot
+from saccade.robots.isaac_processor import CLASSES, checked_ids, processor_robot
+from saccade.robots.lerobot import lerobot_robot, pipeline_ids
 from saccade.robots.robot import Dims, Robot, finished
 
 #: Where a training leaves the processor's files, if not next to the weights.
@@ -71,6 +71,15 @@ def processor_version(folder: Path, values: Mapping[str, Any]) -> str | None:
     return MODEL_TYPES.get(str(read_json(folder / "config.json").get("model_type")))
 
 
+def embodiment_ids(folder: Path) -> dict[str, int]:
+    """Ids by tag in the files of a checkpoint from which :func:`read` takes them; empty without such a file.
+
+    Raises:
+        CheckpointError: A file is damaged.
+    """
+    return pipeline_ids(folder) or _processor_ids(folder)
+
+
 def _from_path(path: Path, options: Options) -> Robot:
     """The robot of one file, or of the first of ``FILES`` in a directory that has statistics."""
     if not os.path.isdir(path):  # noqa: PTH112 (Path.is_dir raises OSError if a name is too long)
@@ -90,15 +99,20 @@ def _processor(path: Path, values: Mapping[str, Any], options: Options) -> Robot
     if "processor_kwargs" not in values:
         return None
     folder = processor_folder(path)
-    ids = read_json(folder / "embodiment_id.json") if (folder / "embodiment_id.json").is_file() else {}
     return processor_robot(
         str(folder / "processor_config.json"),
         processor_version(path, values),
         values["processor_kwargs"],
         read_json(folder / "statistics.json"),
-        ids,
+        _processor_ids(path),
         options,
     )
+
+
+def _processor_ids(path: Path) -> dict[str, int]:
+    """The ids that are beside the processor of N1.6 and N1.7."""
+    file = processor_folder(path) / "embodiment_id.json"
+    return checked_ids(str(file), read_json(file)) if file.is_file() else {}
 
 
 def _metadata(path: Path, values: Mapping[str, Any], options: Options) -> Robot:

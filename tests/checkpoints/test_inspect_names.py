@@ -1,0 +1,74 @@
+"""`saccade inspect` names embodiments by the files from which the loader takes their ids."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+import saccade
+from saccade.checkpoints.inspection import inspect
+from saccade.errors import CheckpointError
+from tests.helpers import layouts
+from tests.helpers.lfs_pointer import POINTER
+
+
+def names_of(folder: Path) -> list[list[str]]:
+    return [entry.names for entry in inspect(folder).embodiments]
+
+
+def moved(folder: Path) -> Path:
+    """The folder, with the processor's files where a trainer leaves them."""
+    (folder / "processor").mkdir()
+    for name in ("processor_config.json", "statistics.json", "embodiment_id.json"):
+        (folder / name).rename(folder / "processor" / name)
+    return folder
+
+
+def test_names_that_a_checkpoint_brings_come_first(tmp_path: Path) -> None:
+    folder = layouts.write(tmp_path / "n17", "n17")
+    names = names_of(folder)
+    assert names[2] == ["libero_sim"]
+    assert names[10] == ["new_embodiment"]
+    assert names[31] == []
+    (folder / "embodiment_id.json").write_text('{"x": 7, "new_embodiment": 11}')
+    assert names_of(folder)[7] == ["x"]
+    names = names_of(moved(folder))
+    assert names[7] == ["x"]
+    assert saccade.Normalizer.from_pretrained(folder, "new_embodiment").embodiment_id == 11
+    assert names[11] == ["new_embodiment"]
+    (folder / "processor" / "embodiment_id.json").unlink()
+    assert names_of(folder)[10][0] == "new_embodiment"  # the released ones
+
+
+@pytest.mark.parametrize("text", ["[]", '{"a": "b", "c": [1]}', "{", POINTER])
+@pytest.mark.parametrize("folder", [".", "processor"])
+def test_damaged_ids_are_not_replaced_by_the_released_ones(folder: str, text: str, tmp_path: Path) -> None:
+    source = layouts.write(tmp_path / "n17", "n17")
+    if folder == "processor":
+        moved(source)
+    path = source / folder / "embodiment_id.json"
+    path.write_text(text)
+    for read in (inspect, saccade.Normalizer.from_pretrained):
+        with pytest.raises(CheckpointError, match=re.escape(str(path))):
+            read(source)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "[]",
+        "{",
+        POINTER,
+        '{"steps": [{"registry_name": "groot_", "config": {"embodiment_mapping": {"a": "b"}}}]}',
+    ],
+)
+def test_nor_are_those_of_a_damaged_pipeline(text: str, tmp_path: Path) -> None:
+    source = layouts.write(tmp_path / "lerobot", "lerobot")
+    assert "unitree_g1" in names_of(source)[3]
+    path = source / "policy_preprocessor.json"
+    path.write_text(text)
+    for read in (inspect, saccade.Normalizer.from_pretrained):
+        with pytest.raises(CheckpointError, match=re.escape(str(path))):
+            read(source)
