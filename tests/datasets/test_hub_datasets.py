@@ -58,6 +58,21 @@ def test_what_cannot_be_downloaded(hub: Hub, tmp_path: Path) -> None:
     assert opened(hub, tmp_path, repr(NAME)).startswith(f"PermissionError path_or_id: {NAME}: the Hub denies")
 
 
+def test_an_incomplete_download_is_said_to_be_one(hub: Hub, tmp_path: Path) -> None:
+    hub.cut = "videos/observation.images.front/chunk-000/file-000.mp4"
+    stopped = opened(hub, tmp_path, repr(NAME))
+    assert stopped.startswith(f"FileNotFoundError path_or_id: {NAME}: the download stopped (")
+    offline = opened(hub, tmp_path, repr(NAME), HF_HUB_OFFLINE="1")
+    assert offline.startswith(f"FileNotFoundError path_or_id: {NAME}: the download is incomplete: ")
+    assert hub.cut in offline
+    hub.status = 503  # the Hub answers, but to nothing
+    assert opened(hub, tmp_path, repr(NAME)) == offline
+    hub.status, hub.cut = None, ""
+    expected = "found 3 (48, 64, 3) v3.0"
+    assert opened(hub, tmp_path, repr(NAME)) == expected
+    assert opened(hub, tmp_path, repr(NAME), HF_HUB_OFFLINE="1") == expected
+
+
 def test_a_command_names_the_commit(hub: Hub, tmp_path: Path) -> None:
     """Another process, or the reader of a certificate, finds them when the branch has moved."""
     program = f"""

@@ -38,6 +38,11 @@ def folder_of(name: str, revision: str) -> Path | None:
     return folder if folder.is_dir() else None
 
 
+def snapshot_of(name: str, commit: str, kind: str) -> Path:
+    """The directory of a commit of a ``"model"`` or ``"dataset"``, whether the cache has it or not."""
+    return _repository(name, kind) / "snapshots" / commit
+
+
 def write_revision(name: str, revision: str, commit: str) -> None:
     """Records which commit a revision was when it was downloaded, as ``huggingface_hub`` does."""
     if revision != commit:
@@ -70,5 +75,5 @@ def _listing(folder: Path) -> Path:
     return folder.parent.parent / LISTINGS / f"{folder.name}.json"
 
 
-def _repository(name: str) -> Path:
-    return cache() / f"models--{name.replace('/', '--')}"
+def _repository(name: str, kind: str = "model") -> Path:
+    return cache() / f"{kind}s--{name.replace('/', '--')}"

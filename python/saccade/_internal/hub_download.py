@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import glob
 import importlib.util
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
+from saccade._internal import hub_cache
 from saccade._internal.extras import SACCADE
 from saccade._internal.hub_files import missing_files, wanted
 
@@ -16,6 +19,8 @@ TIMEOUT = 10.0
 OVERLOADED = 429
 SERVER_ERROR = 500
 DENIED = (401, 403)
+#: What to say of a download that ends too early; ``{}`` is why.
+STOPPED = "the download stopped ({}). Call again to continue it: finished files are kept"
 
 
 @dataclass(eq=False)
@@ -30,8 +35,10 @@ class Offline(Exception):
     """Whether the connection failed, rather than being switched off or not installed."""
 
 
-def list_files(name: str, revision: str, argument: str) -> tuple[str, list[str]]:
+def list_files(name: str, revision: str, argument: str, *, kind: str = "model") -> tuple[str, list[str]]:
     """The commit that a revision is now, and the names of all of its files in ascending order.
+
+    ``kind`` is ``"model"`` or ``"dataset"``.
 
     Raises:
         Offline: The Hub cannot be asked.
@@ -49,10 +56,10 @@ def list_files(name: str, revision: str, argument: str) -> tuple[str, list[str]]
 
     try:
         api = HfApi(library_name="saccade")
-        found = api.model_info(name, revision=revision, timeout=TIMEOUT)
+        found = api.repo_info(name, repo_type=kind, revision=revision, timeout=TIMEOUT)
         names = [file.rfilename for file in found.siblings or ()]
         commit = str(found.sha)
-        return commit, sorted(names or api.list_repo_files(name, revision=commit))
+        return commit, sorted(names or api.list_repo_files(name, repo_type=kind, revision=commit))
     except OfflineModeIsEnabled:
         raise Offline("HF_HUB_OFFLINE is set", "Unset it. ") from None
     except _errors() as error:
@@ -73,48 +80,64 @@ def download(name: str, commit: str, files: tuple[str, ...], listed: list[str], 
     from huggingface_hub import snapshot_download
 
     names = [glob.escape(name) for name in wanted(files, listed)]
-    stopped = (
-        f"{argument}: {name}: the download stopped ({{}}). Call again to continue it: finished files are kept"
-    )
-    try:
+    with _errors_of_download(name, commit, argument, STOPPED):
         folder = snapshot_download(name, revision=commit, allow_patterns=names, library_name="saccade")
-    except _errors() as error:
-        refused = _refusal(error, name, commit, argument)
-        if refused is not None:
-            raise refused from error
-        if isinstance(error, OSError) and error.errno is not None and not isinstance(error, ConnectionError):
-            raise  # a full disk, or a cache that cannot be written
-        raise FileNotFoundError(stopped.format(_line(error))) from error
     missing = missing_files(Path(folder), files, listed)  # it returns what it has if the connection fails
     if missing:
-        raise FileNotFoundError(stopped.format(f"it lacks {', '.join(missing)}"))
+        raise FileNotFoundError(f"{argument}: {name}: {STOPPED.format('it lacks ' + ', '.join(missing))}")
     return Path(folder)
 
 
 def download_dataset(name: str, revision: str | None, argument: str) -> Path:
     """Downloads a data set as a whole, and returns the directory of its commit in the cache.
 
-    Without a connection, what the cache has of the revision is returned.
+    Without a connection, what the cache has of the revision is returned, unless it is known to be incomplete.
 
     Raises:
-        FileNotFoundError: There is no such data set or revision, or it cannot be downloaded.
+        FileNotFoundError: There is no such data set or revision, it cannot be downloaded, or the download is
+            incomplete.
         PermissionError: Access is denied.
         OSError: A file cannot be written.
     """
     SACCADE.require("huggingface_hub")
     from huggingface_hub import snapshot_download
 
+    revision = revision or "main"
     try:
-        return Path(snapshot_download(name, repo_type="dataset", revision=revision, library_name="saccade"))
+        commit, listed = list_files(name, revision, argument, kind="dataset")
+        # Before the download, which may be interrupted.
+        hub_cache.write_listing(hub_cache.snapshot_of(name, commit, "dataset"), listed)
+        unfinished = STOPPED
+    except Offline:
+        unfinished = f"no such path{neighbour(name)}, and it cannot be downloaded ({{}})"
+    with _errors_of_download(name, revision, argument, unfinished):
+        found = snapshot_download(name, repo_type="dataset", revision=revision, library_name="saccade")
+    folder = Path(found)
+    missing = [file for file in hub_cache.read_listing(folder) or () if not (folder / file).is_file()]
+    if missing:
+        raise FileNotFoundError(
+            f"{argument}: {name}: the download is incomplete: {folder} lacks {missing[0]}"
+            + (f" and {len(missing) - 1} more" if len(missing) > 1 else "")
+            + ". Call again with a connection to continue it: finished files are kept"
+        )
+    return folder
+
+
+@contextmanager
+def _errors_of_download(name: str, revision: str, argument: str, unfinished: str) -> Iterator[None]:
+    """Raises what the callers document in place of what ``huggingface_hub`` raises.
+
+    ``unfinished`` is what to say if the Hub gave no answer about the repository; ``{}`` in it is why.
+    """
+    try:
+        yield
     except _errors() as error:
-        refused = _refusal(error, name, revision or "main", argument)
+        refused = _refusal(error, name, revision, argument)
         if refused is not None:
             raise refused from error
         if isinstance(error, OSError) and error.errno is not None and not isinstance(error, ConnectionError):
-            raise
-        raise FileNotFoundError(
-            f"{argument}: {name}: no such path{neighbour(name)}, and it cannot be downloaded ({_line(error)})"
-        ) from error
+            raise  # a full disk, or a cache that cannot be written
+        raise FileNotFoundError(f"{argument}: {name}: {unfinished.format(_line(error))}") from error
 
 
 def _errors() -> tuple[type[BaseException], ...]:
