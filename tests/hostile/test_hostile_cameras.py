@@ -40,7 +40,8 @@ def test_steps_that_are_no_integers_are_named(modality: str, tmp_path: Path) -> 
     given = requirements_of_n17(tmp_path, modality, {"delta_indices": [-3, 0]})
     assert getattr(given, f"{modality}_indices") == (-3, 0)
     assert getattr(requirements_of_n17(tmp_path, modality, {}), f"{modality}_indices") is None
-    for steps in (None, "-3 0", 2, {}, [0, "1"], [0.0], [True], [[0]]):
+    wrong: list[Any] = [None, "-3 0", 2, {}, [0, "1"], [0.0], [True], [[0]]]
+    for steps in wrong:
         message = (
             rf"processor_config.json: robot: {modality}: delta_indices: expected a list of integers, got "
         )

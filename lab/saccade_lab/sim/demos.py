@@ -298,8 +298,8 @@ def record_with(
     tasks = {task: Seeds(task, count, out / task) for task, count in counts.items()}
     for task in tasks.values():
         task.directory.mkdir(parents=True, exist_ok=True)
-        file = task.directory / "recording.json"
-        run_settings.begin(file, settings[task.task].to_dict(), task.directory)
+        where = task.directory / "recording.json"
+        run_settings.begin(where, settings[task.task].to_dict(), task.directory)
     lost = []
     try:
         # Failures of the experts are known only after a round; the next one makes up for them.

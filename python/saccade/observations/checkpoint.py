@@ -167,7 +167,7 @@ def _steps(where: Path, modality: str, given: Any) -> tuple[int, ...] | None:
 def _names(given: Any) -> list[str]:
     if not is_list_of(str, given):
         raise ValueError(f"expected names, got {given!r}")
-    return given
+    return list(given)
 
 
 #: Files of a checkpoint that name cameras, in the order in which they are tried: that of the statistics.

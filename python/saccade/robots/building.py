@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, TypeGuard, TypeVar
+from typing import Any
 
 import numpy as np
 
@@ -13,8 +13,6 @@ from saccade.errors import CheckpointError, InputError
 from saccade.robots.data_configs import DataConfig, says_nothing
 from saccade.robots.embodiments import resolved
 from saccade.robots.groups import Group, Statistics
-
-Item = TypeVar("Item")
 
 #: The engine's limit of the width of a head.
 MOST_WIDTH = 1 << 20
@@ -160,7 +158,7 @@ def value_at(values: Any, *names: Any) -> Any:
     return values
 
 
-def is_list_of(kind: type[Item], value: Any) -> TypeGuard[list[Item]]:
+def is_list_of(kind: type, value: Any) -> bool:
     """Whether a value of JSON is a list of values of one type. True and false are not integers."""
     return isinstance(value, list) and all(type(one) is kind for one in value)
 
