@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 import saccade
-from saccade_lab.parallel.arguments import add_arguments as add_worker_arguments
+from saccade._internal.flags import add_processes
 from saccade_lab.parallel.arguments import workers_of
 from saccade_lab.sim.environment_cache import cached_environment
 from saccade_lab.sim.policy import Chunk, Policy
@@ -84,7 +84,7 @@ def main() -> None:
     parser.add_argument("work", type=Path)
     parser.add_argument("trial", type=Path)
     parser.add_argument("out", type=Path)
-    add_worker_arguments(parser, "episodes")
+    add_processes(parser, "episodes")
     args = parser.parse_args()
     trial = json.loads(args.trial.read_text(encoding="utf-8"))["checkpoints"]
     folders = {"bundled": str(saccade.demo_checkpoint())}

@@ -23,8 +23,8 @@ import numpy as np
 import pandas as pd
 
 from saccade._internal.arrays import Float32Array
+from saccade._internal.flags import add_processes
 from saccade.errors import InputError
-from saccade_lab.parallel.arguments import add_arguments as add_worker_arguments
 from saccade_lab.parallel.arguments import workers_of
 from saccade_lab.sim import demos
 from saccade_lab.sim.environment_cache import cached_environment
@@ -302,7 +302,7 @@ def main() -> None:
     )
     parser.add_argument("--large-steps", action="store_true", help=f"train by {LARGE}")
     parser.add_argument("--device", default="cpu", help="torch's name of the device to train on")
-    add_worker_arguments(parser, "episodes")
+    add_processes(parser, "episodes")
     args = parser.parse_args()
     if args.part == "demos":
         record(args.out, args)

@@ -105,3 +105,11 @@ def test_the_help_of_a_default() -> None:
     assert "(default: out/here)" in text
     assert "seed of the noise (default: 0)" in text
     assert parser.parse_args([]).out == Path("out/here")
+
+
+def test_the_default_number_of_jobs() -> None:
+    parser = argparse.ArgumentParser()
+    arguments.add_processes(parser, "episodes")
+    assert arguments.processes(parser.parse_args([])) == {"backend": "loky", "jobs": 1, "address": None}
+    cluster = parser.parse_args(["--backend", "ray", "--address", "first:6379"])
+    assert arguments.processes(cluster) == {"backend": "ray", "jobs": -1, "address": "first:6379"}

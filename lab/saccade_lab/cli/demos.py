@@ -14,7 +14,6 @@ from saccade.cli import EXIT_OK, output
 from saccade_lab import flags as lab_flags
 from saccade_lab.extras import LAB, require
 from saccade_lab.files import writable_directory
-from saccade_lab.parallel.arguments import add_arguments as add_worker_arguments
 from saccade_lab.parallel.arguments import workers_of
 
 HELP = "record demonstrations of the tasks with scripted experts"
@@ -77,7 +76,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default=None,
         help="control steps between recorded observations (default: 3; 5 on LIBERO; 1 with --record)",
     )
-    add_worker_arguments(parser, "demonstrations")
+    arguments.add_processes(parser, "demonstrations")
 
 
 def run(args: argparse.Namespace) -> int:

@@ -13,12 +13,11 @@ from typing import TYPE_CHECKING, Any
 from saccade._internal import flags as arguments
 from saccade._internal.files import sha256_of, write_atomically
 from saccade.cli import EXIT_INTERRUPTED, EXIT_OK, output
-from saccade.errors import InputError, SaccadeError
+from saccade.errors import InputError
 from saccade_lab import flags as lab_flags
 from saccade_lab.extras import LAB, require
 from saccade_lab.files import path_text, writable_directory
-from saccade_lab.parallel import Lost, Workers, each
-from saccade_lab.parallel.arguments import add_arguments as add_worker_arguments
+from saccade_lab.parallel import Lost, Workers, check_lost, each
 from saccade_lab.parallel.arguments import workers_of
 
 if TYPE_CHECKING:
@@ -88,7 +87,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     arguments.add_policy_options(parser)
     arguments.add_num_threads(parser, "threads (default: the physical cores; with several processes 1)")
-    add_worker_arguments(parser, "episodes")
+    arguments.add_processes(parser, "episodes")
     arguments.add_out(parser, "out/libero")
     parser.add_argument("--video", action="store_true", help="write an MP4 of every episode")
     arguments.add_json(parser, "print results.json instead of a table")
@@ -181,10 +180,7 @@ def run(args: argparse.Namespace) -> int:
         output.print_json(record, indent=2)
     else:
         show(session, record)
-    if session.lost:
-        raise SaccadeError(
-            f"{len(session.lost)} of {len(session.items)} episodes are missing: {'; '.join(session.lost[:3])}"
-        )
+    check_lost(session.lost, len(session.items))
     return EXIT_INTERRUPTED if interrupted else EXIT_OK
 
 

@@ -14,12 +14,10 @@ from saccade._internal import flags as arguments
 from saccade._internal.files import write_atomically, write_json
 from saccade._internal.flags import add_data_config, add_overrides
 from saccade.cli import EXIT_INTERRUPTED, EXIT_OK, output
-from saccade.errors import SaccadeError
 from saccade_lab import flags as lab_flags
 from saccade_lab.extras import LAB, require
 from saccade_lab.files import path_text, writable_directory
-from saccade_lab.parallel import Lost, Workers, each
-from saccade_lab.parallel.arguments import add_arguments as add_worker_arguments
+from saccade_lab.parallel import Lost, Workers, check_lost, each
 from saccade_lab.parallel.arguments import workers_of
 
 if TYPE_CHECKING:
@@ -80,7 +78,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     arguments.add_num_threads(
         parser, "threads of the action head (default: the physical cores; with several processes 1)"
     )
-    add_worker_arguments(parser, "episodes")
+    arguments.add_processes(parser, "episodes")
     arguments.add_out(parser, "out/rollout")
     parser.add_argument("--video", action="store_true", help="write an MP4 of every episode")
     lab_flags.add_record(parser)
@@ -185,11 +183,7 @@ def run(args: argparse.Namespace) -> int:
         output.print_json(session.record(), indent=2)
     else:
         show(session)
-    if session.lost:
-        total = len(session.tasks) * len(session.seeds)
-        raise SaccadeError(
-            f"{len(session.lost)} of {total} episodes are missing: {'; '.join(session.lost[:3])}"
-        )
+    check_lost(session.lost, len(session.tasks) * len(session.seeds))
     return EXIT_INTERRUPTED if interrupted else EXIT_OK
 
 

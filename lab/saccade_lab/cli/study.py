@@ -11,7 +11,6 @@ from saccade._internal import flags as arguments
 from saccade.cli import EXIT_OK, Parser, output
 from saccade_lab.extras import LAB, require
 from saccade_lab.files import writable_directory
-from saccade_lab.parallel.arguments import add_arguments as add_worker_arguments
 from saccade_lab.parallel.arguments import workers_of
 from saccade_lab.study.study import STUDIES, Study, load_study
 
@@ -75,7 +74,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def add_common_arguments(parser: argparse.ArgumentParser) -> None:
     """Declares what every study takes."""
     arguments.add_out(parser, "out/study", "directory of the tables")
-    add_worker_arguments(parser, "cells")
+    arguments.add_processes(parser, "cells")
     arguments.add_json(parser, "print table and provenance as JSON")
 
 

@@ -5,7 +5,7 @@
 ``cluster`` are the two kinds of processes; ``files`` brings checkpoints to other machines.
 """
 
-from saccade_lab.parallel.run import each
+from saccade_lab.parallel.run import check_lost, each
 from saccade_lab.parallel.workers import ALONE, Lost, Workers
 
-__all__ = ["ALONE", "Lost", "Workers", "each"]
+__all__ = ["ALONE", "Lost", "Workers", "check_lost", "each"]

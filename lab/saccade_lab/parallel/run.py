@@ -1,10 +1,11 @@
-"""The one function that runs work items."""
+"""The one function that runs work items, and the error that names those that are lost."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
+from saccade.errors import SaccadeError
 from saccade_lab.parallel.workers import Item, Lost, Result, Workers
 
 
@@ -51,3 +52,17 @@ def each(
     from saccade_lab.parallel import local
 
     return local.each(work, items, workers.jobs)
+
+
+def check_lost(lost: Sequence[str], total: int) -> None:
+    """Checks that no episode is lost.
+
+    Args:
+        lost: Each lost episode and the reason, in words.
+        total: Number of episodes.
+
+    Raises:
+        SaccadeError: There are some; the message says how many and names three.
+    """
+    if lost:
+        raise SaccadeError(f"{len(lost)} of {total} episodes are missing: {'; '.join(lost[:3])}")

@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
-from saccade.errors import SaccadeError
-from saccade_lab.parallel import Lost, Workers, each
+from saccade_lab.parallel import Lost, Workers, check_lost, each
 from saccade_lab.parallel.workers import Result
 
 
@@ -14,7 +13,7 @@ def spread(
     work: Callable[[int], Result],
     episodes: Sequence[int],
     *,
-    jobs: int | None,
+    jobs: int,
     backend: str,
     address: str | None,
     num_threads: int | None,
@@ -25,15 +24,14 @@ def spread(
     Args:
         work: Function from an episode to its record.
         episodes: Its arguments.
-        jobs, backend, address, num_threads: As the flags of ``saccade_lab.parallel.arguments``.
+        jobs, backend, address: As ``Workers``.
+        num_threads: Threads of one episode; None for 1.
         files: Files and directories that ``work`` reads, which are brought to each machine.
 
     Raises:
         MissingExtraError, InputError: As ``saccade_lab.parallel.each``.
         SaccadeError: Processes died again and again; raised when all other episodes are done.
     """
-    if jobs is None:
-        jobs = -1 if backend == "ray" else 1
     workers = Workers(backend, jobs, address, num_threads or 1)
     lost = []
     for episode, record in each(work, episodes, workers, files):
@@ -41,5 +39,4 @@ def spread(
             lost.append(f"episode {episode}: {record.reason}")
         else:
             yield episode, record
-    if lost:
-        raise SaccadeError(f"{len(lost)} of {len(episodes)} episodes are missing: {'; '.join(lost[:3])}")
+    check_lost(lost, len(episodes))

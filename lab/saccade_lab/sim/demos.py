@@ -23,8 +23,8 @@ from saccade._internal import run_settings
 from saccade._internal.arrays import Float32Array
 from saccade._internal.files import write_atomically
 from saccade._internal.small_files import read_json
-from saccade.errors import InputError, SaccadeError
-from saccade_lab.parallel import ALONE, Lost, Workers, each
+from saccade.errors import InputError
+from saccade_lab.parallel import ALONE, Lost, Workers, check_lost, each
 from saccade_lab.sim import environment_cache
 from saccade_lab.sim.cameras import DEFAULT_CAMERAS, DEFAULT_IMAGE_SIZE, CameraPose
 from saccade_lab.sim.experts import Expert, NoiseBursts
@@ -321,8 +321,7 @@ def record_with(
                     temporary.write_bytes(file)
                 task.done += 1
                 on_episode(name)
-            if lost:
-                raise SaccadeError(f"{len(lost)} episodes are missing: {'; '.join(lost[:3])}")
+            check_lost(lost, sum(counts.values()))
     finally:
         environment_cache.close()
 

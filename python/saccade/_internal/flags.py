@@ -240,6 +240,51 @@ def add_num_threads(
     add_integer(parser, "--num-threads", default=default, help=help)
 
 
+def add_processes(parser: argparse.ArgumentParser, items: str, heading: str = "several processes") -> None:
+    """Declares where a command runs; see `processes`.
+
+    Args:
+        parser: Parser of the command.
+        items: What is computed at the same time, in the plural.
+        heading: Title of the group of flags.
+    """
+    group = parser.add_argument_group(heading)
+    group.add_argument(
+        "--jobs",
+        type=int,
+        metavar="N",
+        help=f"{items} computed at the same time, in processes of their own; -1 for one per core; with 1 "
+        "the command itself computes (default: 1; with ray -1)",
+    )
+    group.add_argument(
+        "--backend",
+        choices=("loky", "ray"),
+        default="loky",
+        help="processes on this machine, or on a Ray cluster (default: loky)",
+    )
+    group.add_argument(
+        "--address",
+        metavar="ADDRESS",
+        help="address of the Ray cluster (default: RAY_ADDRESS, or the one that runs on this machine)",
+    )
+
+
+def processes(args: argparse.Namespace) -> dict[str, Any]:
+    """Backend, number of jobs and address, from the flags of `add_processes`.
+
+    Raises:
+        UsageError: The number of jobs is out of range, or an address is given without Ray.
+    """
+    jobs = args.jobs
+    if jobs is None:
+        jobs = -1 if args.backend == "ray" else 1
+    if jobs < 1 and jobs != -1:
+        raise UsageError(f"--jobs: given {jobs}, expected at least 1, or -1 for one per core")
+    if args.address is not None and args.backend != "ray":
+        raise UsageError(f"--address: only with --backend ray, given {args.backend}")
+    return {"backend": args.backend, "jobs": jobs, "address": args.address}
+
+
 def add_num_steps(parser: Arguments, help: str = "Euler steps (default: those of the checkpoint)") -> None:
     """Declares the number of Euler steps."""
     add_integer(parser, "--num-steps", help=help)

@@ -41,21 +41,7 @@ def add_run(parser: argparse.ArgumentParser, episodes: str) -> None:
     arguments.add_json(parser, "print results.json instead of a table")
     add_policy_options(parser)
     arguments.add_num_threads(parser, "threads (default: the physical cores; with several processes 1)")
-    several = parser.add_argument_group("several processes (need the lab)")
-    several.add_argument(
-        "--jobs",
-        type=int,
-        metavar="N",
-        help="episodes computed at the same time, in processes of their own; -1 for one per core (default: "
-        "1; with ray -1)",
-    )
-    several.add_argument(
-        "--backend",
-        choices=("loky", "ray"),
-        default="loky",
-        help="processes on this machine, or on a Ray cluster (default: loky)",
-    )
-    several.add_argument("--address", metavar="ADDRESS", help="address of the Ray cluster")
+    arguments.add_processes(parser, "episodes", "several processes (need the lab)")
 
 
 def source_of(args: argparse.Namespace) -> Source:
@@ -70,7 +56,7 @@ def source_of(args: argparse.Namespace) -> Source:
 
 def is_spread(args: argparse.Namespace) -> bool:
     """Whether other processes compute."""
-    return args.backend != "loky" or args.jobs not in (None, 1) or args.address is not None
+    return args.backend != "loky" or args.jobs not in (None, 1)
 
 
 def extension(name: str) -> Callable[..., Any] | None:
@@ -91,10 +77,7 @@ def check_processes(args: argparse.Namespace) -> None:
     Raises:
         UsageError: A flag is out of range, or the lab is missing; the message says how to install it.
     """
-    if args.jobs is not None and args.jobs < 1 and args.jobs != -1:
-        raise UsageError(f"--jobs: given {args.jobs}, expected at least 1, or -1 for one per core")
-    if args.address is not None and args.backend != "ray":
-        raise UsageError(f"--address: only with --backend ray, given {args.backend}")
+    arguments.processes(args)
     if is_spread(args) and extension("spread") is None:
         raise UsageError(
             f"--jobs, --backend: need {LAB}, which is not installed. Install with: "
@@ -137,9 +120,7 @@ def _each(
     found: Iterator[tuple[int, Record]] = spread(
         work,
         todo,
-        jobs=args.jobs,
-        backend=args.backend,
-        address=args.address,
+        **arguments.processes(args),
         num_threads=args.num_threads,
         files=[path for path in paths if path.exists()],
     )

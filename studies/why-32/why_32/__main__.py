@@ -12,7 +12,6 @@ from saccade.cli import EXIT_OK, Parser, describe, plain_warnings, refuse, termi
 from saccade.errors import SaccadeError
 from saccade_lab.cli.study import compute
 from saccade_lab.files import writable_directory
-from saccade_lab.parallel.arguments import add_arguments as add_worker_arguments
 from saccade_lab.study.table import read_study, table_path
 from why_32.report import require_commits, write_report
 from why_32.study import Answer
@@ -28,7 +27,7 @@ def build_parser() -> argparse.ArgumentParser:
     run = commands.add_parser("run", help="train the policies of the plan and judge them")
     Answer.add_arguments(run)
     flags.add_out(run, "out/why-32", "directory of the table and of what is trained")
-    add_worker_arguments(run, "cells")
+    flags.add_processes(run, "cells")
     report = commands.add_parser("report", help="write report.md and its figures from the table")
     report.add_argument(
         "directory", type=Path, nargs="?", default=HERE, metavar="DIR", help="the --out of run"

@@ -244,8 +244,8 @@ def test_block_zero_of_the_future_rows_holds_vision_alone() -> None:
         (("cuts", "--episodes", "0"), "--episodes: given 0, expected at least 1"),
         (("cuts", "--seed", "1000000"), "expected evaluation seeds, 0 to 999999"),
         (("cuts", "--checkpoint", "nowhere"), "nowhere: no such checkpoint directory"),
-        (("cuts", "--jobs", "0"), "jobs: given 0"),
-        (("cuts", "--backend", "dask"), "backend: unknown name 'dask', expected one of loky, ray"),
+        (("cuts", "--jobs", "0"), "--jobs: given 0"),
+        (("cuts", "--backend", "dask"), "argument --backend: invalid choice: 'dask'"),
         (
             ("patching", "--kinds", "colour"),
             "--kinds: unknown name 'colour', expected one of layout, words, task",
