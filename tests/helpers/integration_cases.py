@@ -192,8 +192,13 @@ def check_chunking(case: Case) -> float:
         actions = ours.results["action_pred"]
         assert actions.shape[1] == horizon
         torch.testing.assert_close(actions[:, :frozen], previous[:, 5 - overlap : 5 - overlap + frozen])
-    with accelerate(case.head), pytest.raises(saccade.InputError, match="options"):
-        call(case, given)
+    with accelerate(case.head):
+        with pytest.raises(
+            saccade.InputError, match=r"^options: .* without action_horizon, rtc_overlap_steps"
+        ):
+            call(case, given)
+        with pytest.raises(saccade.InputError, match=r"^options: rtc_frozen_steps: expected at most 3"):
+            call(case, given, options=options | {"rtc_overlap_steps": 3, "rtc_frozen_steps": 4})
     return max(errors)
 
 

@@ -2,11 +2,18 @@
 
 from __future__ import annotations
 
+import itertools
 import math
+import numbers
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 from saccade._internal.arrays import integer
 from saccade.errors import InputError
+
+#: The options of real-time chunking in the released head of N1.7, which needs all of them.
+RELEASED = ("action_horizon", "rtc_overlap_steps", "rtc_frozen_steps", "rtc_ramp_rate")
 
 
 @dataclass(frozen=True)
@@ -72,3 +79,43 @@ class Chunking:
         plain = {"overlap": overlap, "frozen": frozen, "ramp_rate": ramp_rate, "horizon": horizon}
         for name, value in plain.items():
             object.__setattr__(self, name, value)
+
+
+def from_released(options: Mapping[str, Any]) -> Chunking:
+    """Real-time chunking by the released names, all of which are needed.
+
+    Args:
+        options: Values by name; other names are not read.
+
+    Raises:
+        InputError: A name is missing, or a value is not a number in its range.
+    """
+    missing = [name for name in RELEASED if name not in options]
+    if missing:
+        given = ", ".join(name for name in RELEASED if name in options)
+        raise InputError(
+            f"options: real-time chunking: expected all of {', '.join(RELEASED)}, got {given or 'none'} "
+            f"without {', '.join(missing)}"
+        )
+    counts = {name: integer(f"options: {name}", options[name], least=0) for name in RELEASED[:3]}
+    for limit, name in itertools.pairwise(counts):
+        if counts[name] > counts[limit]:
+            raise InputError(
+                f"options: {name}: expected at most {counts[limit]} ({limit}), got {counts[name]}"
+            )
+    horizon, overlap, frozen = counts.values()
+    integer("options: action_horizon", horizon)
+    ramp_rate = check_ramp_rate("options: rtc_ramp_rate", options["rtc_ramp_rate"])
+    return Chunking(overlap, frozen, ramp_rate, horizon)
+
+
+def check_ramp_rate(name: str, value: object) -> float:
+    """How fast the factor of :class:`Chunking` increases.
+
+    Raises:
+        InputError: It is not a finite number above 0.
+    """
+    is_number = isinstance(value, numbers.Real) and not isinstance(value, bool)
+    if not is_number or not 0 < value < math.inf:  # type: ignore[operator]
+        raise InputError(f"{name}: expected a finite number above 0, got {value!r:.100}")
+    return float(value)  # type: ignore[arg-type]

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from saccade.backbone.backbone import Backbone
 from saccade.errors import InputError
-from saccade.head.chunking import Chunking
+from saccade.head.chunking import from_released
 from saccade.head.config import HeadConfig
 from saccade.head.head import ActionHead
 from saccade.head.options import LoadOptions, precisions_of_parts
@@ -29,9 +29,6 @@ ROUNDED_ROUNDING = 1e-2
 #: The tokens of the check's observation: text, two image tokens, and text that is padding.
 CHECK_IMAGE = (False, True, True, False)
 CHECK_ATTENDED = (True, True, True, False)
-
-#: The options of real-time chunking, in the released names.
-CHUNKING_OPTIONS = ("action_horizon", "rtc_overlap_steps", "rtc_frozen_steps", "rtc_ramp_rate")
 
 
 def accelerate(
@@ -272,17 +269,11 @@ class Accelerated(StandIn[ActionHead]):
                     "or restore() the original"
                 )
             return {}
-        missing = [name for name in CHUNKING_OPTIONS if name not in (options or {})]
-        if options is None or missing:
-            raise InputError(f"options: real-time chunking (action is given) needs {', '.join(missing)}")
-        horizon, overlap = int(options["action_horizon"]), int(options["rtc_overlap_steps"])
-        if overlap == 0:
+        chunking = from_released(options or {})
+        if chunking.overlap == 0:
             return {}
-        frozen, ramp_rate = int(options["rtc_frozen_steps"]), float(options["rtc_ramp_rate"])
-        return {
-            "previous_chunk": action_input["action"][:, :horizon].to("cpu", dtype),
-            "chunking": Chunking(overlap, frozen, ramp_rate, horizon),
-        }
+        previous = action_input["action"][:, : chunking.horizon].to("cpu", dtype)
+        return {"previous_chunk": previous, "chunking": chunking}
 
 
 def draw(config: HeadConfig, batch: int, dtype: torch.dtype, device: torch.device) -> Tensor:

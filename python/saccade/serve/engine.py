@@ -15,13 +15,13 @@ import numpy as np
 import saccade._saccade as _saccade
 from saccade._internal.arrays import Float32Array
 from saccade.errors import InputError
-from saccade.head.chunking import Chunking
+from saccade.head.chunking import RELEASED, Chunking
 from saccade.head.options import check_guidance, noise_or_draw
 from saccade.policy.encoding import compute_features, encode_features
 from saccade.policy.guidance import Without, named, without_words
 from saccade.policy.preparing import prepare_inputs
 from saccade.serve.batching import Job
-from saccade.serve.requests import CHUNKING, RELEASED_CHUNKING
+from saccade.serve.requests import CHUNKING
 from saccade.serve.sessions import Chunk, Session, Sessions
 
 if TYPE_CHECKING:
@@ -222,7 +222,7 @@ def _info(work: _Work) -> dict[str, Any]:
     options = work.job.call.options
     applied = dict(options.stated)
     if work.continued is None:
-        for name in (*CHUNKING, *RELEASED_CHUNKING):
+        for name in (*CHUNKING, *RELEASED):
             applied.pop(name, None)
     elif "frozen" in applied:
         applied["frozen"] = work.continued[1].frozen  # which are not more than there are to continue

@@ -8,15 +8,13 @@ from __future__ import annotations
 
 import hashlib
 import hmac
-import itertools
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 from saccade._internal.arrays import integer
 from saccade.errors import InputError
-from saccade.head.chunking import Chunking
+from saccade.head.chunking import RELEASED, Chunking, check_ramp_rate, from_released
 from saccade.head.options import LARGEST
 
 ENDPOINTS = ("ping", "get_action", "reset", "get_modality_config", "kill")
@@ -24,12 +22,10 @@ ENDPOINTS = ("ping", "get_action", "reset", "get_modality_config", "kill")
 PING = {"status": "ok", "message": "Server is running"}
 UNAUTHORIZED = "Unauthorized: Invalid API token"
 
-#: How a chunk continues the last one of its session: in saccade's words, or in those of the released head of
-#: N1.7, which needs all of its four.
+#: How a chunk continues the last one of its session: in saccade's words, or in ``RELEASED`` ones.
 CHUNKING = ("executed", "frozen", "ramp_rate")
-RELEASED_CHUNKING = ("action_horizon", "rtc_overlap_steps", "rtc_frozen_steps", "rtc_ramp_rate")
 #: The keys of `options` that this server reads.
-OPTIONS = ("seed", "num_steps", "guidance", "session", *CHUNKING, *RELEASED_CHUNKING)
+OPTIONS = ("seed", "num_steps", "guidance", "session", *CHUNKING, *RELEASED)
 LONGEST_SESSION = 256
 #: Names of options that were not read, as an answer lists them.
 MOST_IGNORED = 8
@@ -140,17 +136,15 @@ def _options(given: Any, num_timestep_buckets: int) -> Options:
         )
     if session is None and any(name in found for name in CHUNKING):
         raise InputError("options: executed, frozen and ramp_rate: expected a session with them, got none")
-    unread = () if session is not None else RELEASED_CHUNKING
+    unread = () if session is not None else RELEASED
     read: dict[str, Any] = {}
     for name, value in found.items():
-        if name in unread or name == "session":
+        if name in RELEASED or name == "session":
             continue
         if name == "num_steps":
             read[name] = check_num_steps(f"options: {name}", value, num_timestep_buckets)
-        elif name in ("ramp_rate", "rtc_ramp_rate"):
-            if type(value) not in (int, float) or not math.isfinite(value) or value <= 0:
-                raise InputError(f"options: {name}: expected a finite number above 0, got {value!r:.100}")
-            read[name] = float(value)
+        elif name == "ramp_rate":
+            read[name] = check_ramp_rate(f"options: {name}", value)
         elif name == "guidance":
             if type(value) not in (int, float) or not 0 <= value <= LARGEST:
                 raise InputError(
@@ -160,37 +154,24 @@ def _options(given: Any, num_timestep_buckets: int) -> Options:
         else:
             read[name] = integer(f"options: {name}", value, least=0)
     ignored = [str(key)[:LONGEST_SESSION] for key in given if key not in OPTIONS or key in unread]
-    own = {name: read[name] for name in ("seed", "num_steps", "guidance", *CHUNKING) if name in read}
+    released = {name: found[name] for name in RELEASED if name in found and name not in unread}
     return Options(
-        **own,
+        **read,
         session=session,
-        chunking=_released(read),
-        stated=read if session is None else {"session": session, **read},
+        chunking=_chunking(read, released),
+        stated=read if session is None else {"session": session, **read, **released},
         ignored=tuple(ignored[:MOST_IGNORED]),
     )
 
 
-def _released(read: Mapping[str, Any]) -> Chunking | None:
+def _chunking(read: Mapping[str, Any], released: Mapping[str, Any]) -> Chunking | None:
     """Real-time chunking in the released names; None if it was not asked for by them."""
-    given = [name for name in RELEASED_CHUNKING if name in read]
-    if not given:
+    if not released:
         return None
     own = [name for name in CHUNKING if name in read]
     if own:
         raise InputError(
             f"options: expected real-time chunking by saccade's options ({', '.join(CHUNKING)}) or by "
-            f"Isaac-GR00T's ({', '.join(RELEASED_CHUNKING)}), got {', '.join([*own, *given])}"
+            f"Isaac-GR00T's ({', '.join(RELEASED)}), got {', '.join([*own, *released])}"
         )
-    missing = [name for name in RELEASED_CHUNKING if name not in read]
-    if missing:
-        raise InputError(
-            f"options: real-time chunking: expected all of {', '.join(RELEASED_CHUNKING)}, got "
-            f"{', '.join(given)} without {', '.join(missing)}"
-        )
-    horizon, overlap, frozen, ramp_rate = (read[name] for name in RELEASED_CHUNKING)
-    for limit, name in itertools.pairwise(RELEASED_CHUNKING[:3]):
-        if read[name] > read[limit]:
-            raise InputError(f"options: {name}: expected at most {read[limit]} ({limit}), got {read[name]}")
-    if horizon < 1:
-        raise InputError(f"options: action_horizon: expected at least 1, got {horizon}")
-    return Chunking(overlap, frozen, ramp_rate, horizon)
+    return from_released(released)

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from saccade.errors import InputError
-from saccade.head.chunking import Chunking
-from saccade.serve.requests import RELEASED_CHUNKING, Options
+from saccade.head.chunking import RELEASED, Chunking
+from saccade.serve.requests import Options
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +47,7 @@ class Session:
         if chunking is None:
             raise InputError(
                 "options: executed: expected the number of actions that were executed of the last chunk of "
-                f"session {options.session!r:.100}, or {', '.join(RELEASED_CHUNKING)}, got none; "
+                f"session {options.session!r:.100}, or {', '.join(RELEASED)}, got none; "
                 "reset starts a new chunk"
             )
         if rows != chunk.rows:
