@@ -31,6 +31,16 @@ UINT8 = np.dtype(np.uint8)
 #: The precisions that weights are loaded in.
 PRECISIONS = ("float32", "bfloat16", "int8", "int4")
 
+#: What else decides how a policy is loaded: arguments of ``Policy.from_pretrained``, and flags.
+LOADING_OPTIONS = (
+    "embodiment",
+    "preprocessing",
+    "tokenizer",
+    "data_config",
+    "action_horizon",
+    "processor_options",
+)
+
 #: No head has as many tokens. A larger range is refused, since it would be slow to write out.
 LARGEST_RANGE = 1 << 20
 

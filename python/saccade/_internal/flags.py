@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any, TypeAlias
 
-from saccade._internal.arrays import PRECISIONS
+from saccade._internal.arrays import LOADING_OPTIONS, PRECISIONS
 from saccade._internal.small_files import read_json
 
 #: A parser, or a group of its arguments.
@@ -358,10 +358,7 @@ def json_object(word: str) -> dict[str, Any]:
 
 
 #: The arguments that say how a policy is loaded, but for the precision.
-LOADING = (
-    *("embodiment", "preprocessing", "tokenizer", "data_config", "action_horizon", "processor_options"),
-    "num_threads",
-)
+LOADING = (*LOADING_OPTIONS, "num_threads")
 
 
 def policy_options(args: argparse.Namespace) -> dict[str, Any]:

@@ -6,7 +6,7 @@ import argparse
 import dataclasses
 from typing import TYPE_CHECKING
 
-from saccade._internal.flags import UsageError, loading_options
+from saccade._internal.flags import LOADING, UsageError, loading_options
 from saccade.cli import EXIT_OK, output, require
 from saccade.cli.output import Section, show
 
@@ -14,10 +14,7 @@ if TYPE_CHECKING:
     from saccade.checkpoints.precisions import Difference, PrecisionCheck
 
 #: The arguments that need `--precision-check`; None where they are not given.
-ARGUMENTS = (
-    *("instruction", "state", "embodiment", "preprocessing", "tokenizer", "action_horizon"),
-    *("processor_options", "seed", "num_threads"),
-)
+ARGUMENTS = ("instruction", "state", "seed", *(name for name in LOADING if name != "data_config"))
 
 
 def run(args: argparse.Namespace) -> int:

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from saccade._internal.arrays import Float32Array
+from saccade._internal.arrays import LOADING_OPTIONS, Float32Array
 from saccade._internal.environment import arithmetic, cpu_name
 from saccade._internal.small_files import read_json
 from saccade.errors import InputError
@@ -25,10 +25,7 @@ from saccade.robots import Normalizer
 FORMAT = 2
 MOST = 16  # observations in a certificate, evenly spaced
 #: What a certificate may say of loading and of sampling.
-OPTIONS = (
-    *("embodiment", "preprocessing", "tokenizer", "data_config", "action_horizon", "processor_options"),
-    "precision",
-)
+OPTIONS = (*LOADING_OPTIONS, "precision")
 SAMPLING = ("num_steps", "integrator", "future_refresh")
 TOLERANCE = 1e-3  # of normalised actions elsewhere, or twice the precision's own difference
 #: Where these are equal, the actions must have the same bits. Dot products matter to other precisions.
