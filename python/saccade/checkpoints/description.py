@@ -19,6 +19,8 @@ Source = str | os.PathLike[str]
 #: A config: a mapping, the path of a JSON file, or None for the one that belongs to the checkpoint.
 Config = Mapping[str, Any] | str | os.PathLike[str] | None
 
+#: The dtypes of int8 and int4 weights, each with scales beside it: a tensor of its name and ``_scale``.
+QUANTIZED = ("I8", "U8")
 
 #: What the files' metadata say of the calibration of their weights: JSON.
 CALIBRATION = "saccade_calibration"
@@ -112,6 +114,16 @@ def description_of(published: _saccade.HeadCheckpoint, source: Source) -> Descri
         files=[File(str(file), file.stat().st_size) for file in published.files],
         tensors=[StoredTensor(*tensor) for tensor in published.tensors()],
     )
+
+
+def quantized_dtypes(description: Description) -> set[str]:
+    """The dtypes among ``QUANTIZED`` in which some weights are stored, with scales beside them."""
+    names = {tensor.name for tensor in description.tensors}
+    return {
+        tensor.dtype
+        for tensor in description.tensors
+        if tensor.dtype in QUANTIZED and f"{tensor.name}_scale" in names
+    }
 
 
 def read_tensors(source: Source, prefix: str = "") -> dict[str, Float32Array]:

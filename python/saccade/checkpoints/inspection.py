@@ -15,6 +15,7 @@ from saccade.checkpoints.description import (
     Source,
     description_of,
     open_published,
+    quantized_dtypes,
 )
 from saccade.checkpoints.evidence import from_noise, odd_embodiments, odd_tokens
 from saccade.checkpoints.findings import Counts, Inspection, Memory
@@ -109,8 +110,7 @@ def inspect(
 
 def _rounding(description: Description, calibration: str | None) -> str | None:
     """How int4 weights were rounded, by what the files say of it."""
-    names = {tensor.name for tensor in description.tensors}
-    if not any(tensor.dtype == "U8" and f"{tensor.name}_scale" in names for tensor in description.tensors):
+    if "U8" not in quantized_dtypes(description):
         return None
     if calibration is None:
         return "each weight to the nearest, without calibration"

@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from saccade._internal.arrays import Float32Array, integer
-from saccade.checkpoints.description import describe
+from saccade.checkpoints.description import describe, quantized_dtypes
 from saccade.checkpoints.given_inputs import inputs_sha256
 from saccade.errors import InputError
 from saccade.observations.pictures import PictureObservation, read_frames
@@ -210,15 +210,8 @@ def check_precisions(
         tolerance=TOLERANCE,
         recommended=recommended(found),
         reference=None if reference is None else os.fspath(reference),
-        is_quantized=_is_quantized(source),
+        is_quantized=bool(quantized_dtypes(describe(source))),
     )
-
-
-def _is_quantized(source: str | os.PathLike[str]) -> bool:
-    """Whether some weights are int8 or int4, with scales beside them."""
-    tensors = describe(source).tensors
-    names = {tensor.name for tensor in tensors}
-    return any(tensor.dtype in ("I8", "U8") and f"{tensor.name}_scale" in names for tensor in tensors)
 
 
 def _described(policy: Policy, recorded: Sequence[PictureObservation]) -> dict[str, Any]:

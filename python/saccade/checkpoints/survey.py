@@ -13,6 +13,7 @@ import numpy as np
 
 import saccade._saccade as _saccade
 from saccade._internal.arrays import Float32Array
+from saccade.checkpoints.description import QUANTIZED
 from saccade.checkpoints.findings import (
     UNUSED,
     Embodiment,
@@ -99,7 +100,7 @@ class Survey:
                 progress(done, total)
 
     def _slices(self, name: str, dtype: str, shape: tuple[int, ...]) -> Iterator[Slice]:
-        is_drawn = dtype not in ("I8", "U8") and part_of(name) != UNUSED and not name.endswith("_scale")
+        is_drawn = dtype not in QUANTIZED and part_of(name) != UNUSED and not name.endswith("_scale")
         drawn = draw(name, self._inputs(name, shape)) if is_drawn else None
         is_category = name.endswith((".W", ".b"))
         indices: list[int | None] = list(range(shape[0])) if is_category else [None]
