@@ -41,6 +41,9 @@ LOADING_OPTIONS = (
     "processor_options",
 )
 
+#: The largest number that the engine computes with, float32's.
+LARGEST = float(np.finfo(np.float32).max)
+
 #: No head has as many tokens. A larger range is refused, since it would be slow to write out.
 LARGEST_RANGE = 1 << 20
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from saccade._internal.arrays import Float32Array, UInt8Array, integer
+from saccade._internal.arrays import LARGEST, Float32Array, UInt8Array, integer
 from saccade._internal.files import remembered_sha256
 from saccade.datasets import forms
 from saccade.datasets.features import Episode
@@ -20,9 +20,6 @@ from saccade.datasets.stored import Stored
 from saccade.datasets.videos import Frame
 from saccade.errors import DatasetError, InputError
 from saccade.observations.pictures import ObservingPolicy
-
-#: The largest number that float32 can hold.
-LARGEST = float(np.finfo(np.float32).max)
 
 
 class Dataset:

@@ -9,7 +9,7 @@ from typing import Any, TypedDict
 
 import numpy as np
 
-from saccade._internal.arrays import ArrayLike, Float32Array, apart, does_not_fit, float32, integer
+from saccade._internal.arrays import LARGEST, ArrayLike, Float32Array, apart, does_not_fit, float32, integer
 from saccade.errors import InputError
 from saccade.head.chunking import Chunking
 from saccade.head.intervention import Intervention, as_interventions
@@ -19,10 +19,6 @@ PARTS = ("backbone", "head")
 
 #: Velocity evaluations in one step of each integrator.
 INTEGRATORS = {"euler": 1, "midpoint": 2}
-
-
-#: The largest number that the engine computes with, float32's.
-LARGEST = float(np.finfo(np.float32).max)
 
 
 class LoadOptions(TypedDict, total=False):
@@ -47,11 +43,11 @@ def check_integrator(integrator: object) -> str:
     return integrator
 
 
-def check_guidance(guidance: object) -> float | None:
+def check_guidance(guidance: object, name: str = "guidance") -> float | None:
     """The weight of a guidance. None and 1, which is without one, are None.
 
     Raises:
-        InputError: It is not a finite number of at least 0.
+        InputError: It is not a finite number of at least 0; the message begins with ``name``.
     """
     if guidance is None:
         return None
@@ -61,7 +57,7 @@ def check_guidance(guidance: object) -> float | None:
     except OverflowError:
         weight = math.inf
     if not 0 <= weight <= LARGEST:
-        raise InputError(f"guidance: expected a finite number of at least 0, got {guidance!r}")
+        raise InputError(f"{name}: expected a finite number of at least 0, got {guidance!r:.100}")
     return None if weight == 1 else weight
 
 

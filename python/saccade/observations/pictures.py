@@ -11,7 +11,7 @@ from typing import Any, Protocol, cast
 
 import numpy as np
 
-from saccade._internal.arrays import UInt8Array
+from saccade._internal.arrays import LARGEST, UInt8Array
 from saccade._internal.small_files import read_json_value
 from saccade.errors import InputError, SaccadeError
 from saccade.observations.formats import read
@@ -25,7 +25,6 @@ SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".webp", ".tif", ".tiff", ".ppm")
 MODES = ("1", "L", "LA", "P", "PA", "RGB", "RGBA", "RGBX", "CMYK", "YCbCr", "HSV", "LAB")
 
 STATE = "state.json"
-LARGEST = float(np.finfo(np.float32).max)
 
 
 class ObservingPolicy(Protocol):

@@ -16,7 +16,7 @@ import saccade._saccade as _saccade
 from saccade._internal.arrays import Float32Array
 from saccade.errors import InputError
 from saccade.head.chunking import RELEASED, Chunking
-from saccade.head.options import check_guidance, noise_or_draw
+from saccade.head.options import noise_or_draw
 from saccade.policy.encoding import compute_features, encode_features
 from saccade.policy.guidance import Without, named, without_words
 from saccade.policy.preparing import prepare_inputs
@@ -95,9 +95,10 @@ class Engine:
                     job.error = error
 
     def _weight(self, job: Job) -> float | None:
-        """The weight of a request's guidance; None without."""
+        """The weight of a request's guidance; None without, which 1 says too."""
         own = job.call.options.guidance
-        return check_guidance(self._guidance if own is None else own)
+        weight = self._guidance if own is None else own
+        return None if weight == 1 else weight
 
     def run(self, jobs: Sequence[Job]) -> Sequence[Job]:
         """Computes the actions or the error of requests. An error of one does not affect the others."""

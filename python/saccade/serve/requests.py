@@ -15,7 +15,7 @@ from typing import Any
 from saccade._internal.arrays import integer
 from saccade.errors import InputError
 from saccade.head.chunking import RELEASED, Chunking, check_ramp_rate, from_released
-from saccade.head.options import LARGEST
+from saccade.head.options import check_guidance
 
 ENDPOINTS = ("ping", "get_action", "reset", "get_modality_config", "kill")
 #: What the released servers answer, word for word.
@@ -146,10 +146,7 @@ def _options(given: Any, num_timestep_buckets: int) -> Options:
         elif name == "ramp_rate":
             read[name] = check_ramp_rate(f"options: {name}", value)
         elif name == "guidance":
-            if type(value) not in (int, float) or not 0 <= value <= LARGEST:
-                raise InputError(
-                    f"options: guidance: expected a finite number of at least 0, got {value!r:.100}"
-                )
+            check_guidance(value, f"options: {name}")
             read[name] = float(value)
         else:
             read[name] = integer(f"options: {name}", value, least=0)
