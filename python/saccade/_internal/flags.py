@@ -219,16 +219,15 @@ def add_pictures(parser: Arguments, flag: str) -> None:
     add_words_and_state(parser)
 
 
-def add_words_and_state(parser: Arguments) -> None:
-    """Declares the instruction and the state of observations that are images."""
-    parser.add_argument("--instruction", metavar="TEXT", help="instruction to the robot")
-    parser.add_argument(
-        "--state",
-        type=Path,
-        metavar="FILE",
-        help="JSON: the robot's state in its own units, for observations without a state.json (default: "
-        "the middle of its range)",
-    )
+def add_words_and_state(
+    parser: Arguments,
+    instruction: str = "instruction to the robot",
+    state: str = "JSON: the robot's state in its own units, for observations without a state.json (default: "
+    "the middle of its range)",
+) -> None:
+    """Declares the instruction and the state of observations that are images, with these help texts."""
+    parser.add_argument("--instruction", metavar="TEXT", help=instruction)
+    parser.add_argument("--state", type=Path, metavar="FILE", help=state)
 
 
 def add_num_threads(

@@ -59,8 +59,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="[CAMERA=]FILE",
         help="image of each camera; the name may be left out if there is one camera",
     )
-    seen.add_argument("--instruction", metavar="TEXT", help="what to do")
-    seen.add_argument("--state", type=Path, metavar="FILE", help="JSON: the robot's state in its own units")
+    arguments.add_words_and_state(seen, "what to do", "JSON: the robot's state in its own units")
     add_policy_options(parser)
     arguments.add_seed(parser, "seed of the noise")
     arguments.add_num_steps(parser)

@@ -1,4 +1,4 @@
-"""What `saccade evaluate`, `certify` and `diagnose` share: flags, and episodes in one process or in many."""
+"""What `saccade evaluate` and `diagnose` share: flags, and episodes in one process or in many."""
 
 from __future__ import annotations
 
@@ -24,17 +24,12 @@ Record = TypeVar("Record")
 EXTENSIONS = "saccade.extensions"
 
 
-def add_recordings(parser: argparse.ArgumentParser) -> None:
-    """Declares the recordings."""
-    parser.add_argument(
-        "recordings", metavar="DATASET", help="directory or published id of a LeRobotDataset (extra: data)"
-    )
-
-
 def add_run(parser: argparse.ArgumentParser, episodes: str) -> None:
     """Declares checkpoint, recordings, episodes, processes and the directory of the results."""
     arguments.add_checkpoint_argument(parser)
-    add_recordings(parser)
+    parser.add_argument(
+        "recordings", metavar="DATASET", help="directory or published id of a LeRobotDataset (extra: data)"
+    )
     arguments.add_list(parser, "--episodes", item=int, metavar="N", minimum=0, help=episodes)
     arguments.add_seed(parser, "seed of the noise")
     arguments.add_out(parser, None)
