@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from saccade._internal import flags as arguments
-from saccade._internal.files import sha256_of, write_atomically
+from saccade._internal.files import write_atomically
 from saccade.cli import EXIT_INTERRUPTED, EXIT_OK, output
 from saccade.errors import InputError
 from saccade_lab import flags as lab_flags
@@ -26,8 +26,6 @@ if TYPE_CHECKING:
     from saccade_lab.libero.policy import LiberoPolicy
     from saccade_lab.libero.results import Results
 
-#: Options that may be paths of files.
-FILES = ("data_config", "tokenizer")
 #: Protocols whose programs fail after the last official state; others begin again with the first one.
 END_WITH_STATES = ("isaac-n15",)
 
@@ -107,13 +105,15 @@ class Session:
 
     def run(self) -> None:
         """Runs the episodes that are missing, with a progress bar; the result file follows each of them."""
+        from saccade.evaluation.source import OPTION_FILES
+
         todo = self.results.missing(self.items)
         done = len(self.items) - len(todo)
         begun, count = time.monotonic(), 0
         files = [self.episodes.checkpoint]
         files += [
             value
-            for name in FILES
+            for name in OPTION_FILES
             if isinstance(value := self.episodes.options.get(name), str) and Path(value).exists()
         ]
         with output.progress_bar("libero", len(self.items)) as update:
@@ -188,7 +188,7 @@ def prepare(args: argparse.Namespace, workers: Workers) -> Session:
     """Loads the policy and what is there of the results; nothing is written yet."""
     from saccade._internal.environment import library
     from saccade._internal.hub import locate
-    from saccade.evaluation.source import weights_hash
+    from saccade.evaluation.source import OPTION_FILES, weights_hash
     from saccade_lab.libero import packages
     from saccade_lab.libero.episode import Noise
     from saccade_lab.libero.episodes import Episodes
@@ -202,7 +202,7 @@ def prepare(args: argparse.Namespace, workers: Workers) -> Session:
     checkpoint = location.path
     options = arguments.policy_options(args)
     options["num_threads"] = args.num_threads if workers.alone else workers.num_threads
-    given = {name: Path(options[name]) for name in FILES if options[name] is not None}
+    given = {name: Path(options[name]) for name in OPTION_FILES if options[name] is not None}
     found = {name: path for name, path in given.items() if path.exists()}
     options |= {name: str(path) for name, path in given.items()}
     options |= {name: path_text(path) for name, path in found.items()}  # other machines have it elsewhere
@@ -219,13 +219,7 @@ def prepare(args: argparse.Namespace, workers: Workers) -> Session:
             "sha256": sha256,
         },
         "options": {name: value for name, value in options.items() if name not in ("num_threads", *found)},
-        "option_files": {
-            name: {
-                "name": path.resolve().name,
-                "sha256": weights_hash(path) if path.is_dir() else sha256_of(path),
-            }
-            for name, path in found.items()
-        },
+        "option_files": option_files(checkpoint, options["tokenizer"], found),
         "noise": vars(noise),
         **software(options["precision"]),
     }
@@ -246,6 +240,31 @@ def prepare(args: argparse.Namespace, workers: Workers) -> Session:
     if not args.json:
         announce(policy, settings["protocol"])
     return Session(episodes, items, results, workers, args.out, about)
+
+
+def option_files(
+    checkpoint: Path, tokenizer: str | None, given: Mapping[str, Path]
+) -> dict[str, dict[str, str]]:
+    """Name and hash of the files that are read besides the checkpoint, by the option that names them.
+
+    Args:
+        checkpoint: Directory of the checkpoint.
+        tokenizer: The option ``tokenizer``: a path, an id, or None for that of the checkpoint, or a published
+            one for a checkpoint without one.
+        given: The options that are paths.
+    """
+    from saccade._internal.hub_files import POLICY, TOKENIZER
+    from saccade._internal.tokenizers import tokenizer_path
+    from saccade.evaluation.source import contents_hash
+
+    files = {name: (path, POLICY) for name, path in given.items()}
+    published = None if "tokenizer" in given else tokenizer_path(checkpoint, tokenizer)
+    if published is not None:
+        files["tokenizer"] = (published, TOKENIZER)
+    return {
+        name: {"name": path.resolve().name, "sha256": contents_hash(path, patterns)}
+        for name, (path, patterns) in files.items()
+    }
 
 
 def tasks_of(policy: LiberoPolicy, ran: Iterable[tuple[str, int]]) -> list[dict[str, Any]]:

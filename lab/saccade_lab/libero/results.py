@@ -17,6 +17,7 @@ from saccade._internal.environment import arithmetic
 from saccade._internal.files import write_json
 from saccade._internal.small_files import read_json
 from saccade.errors import InputError
+from saccade.head.options import is_float32
 from saccade_lab.files import changed
 from saccade_lab.intervals import wilson
 from saccade_lab.libero.episode import PARTS, Episode, Key
@@ -111,7 +112,7 @@ class Results:
             if repeated:
                 raise ValueError(f"{' '.join(map(str, repeated[0]))} is there twice")
             # The first records had no dot products, which float32 does not use.
-            unsaid: list[str] | None = [] if _is_float32(record["options"]["precision"]) else None
+            unsaid: list[str] | None = [] if is_float32(record["options"]["precision"]) else None
             earlier = {name: record[name] for name in SETTINGS if name != "dot_products"}
             earlier["dot_products"] = record.get("dot_products", unsaid)
             different = _different(earlier, json.loads(json.dumps(settings)))
@@ -231,7 +232,9 @@ def _different(earlier: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
     files = [
         {name: file["sha256"] for name, file in record["option_files"].items()} for record in (earlier, now)
     ]
-    found += [f"options.{name}" for name in changed(*files)]
+    # The first records had no hash of a tokenizer that is published: it stands in their options alone.
+    unsaid = [name for name in files[1] if name in earlier["options"] and name not in files[0]]
+    found += [f"options.{name}" for name in changed(*files) if name not in unsaid]
     whole = {"protocol", "packages", "checkpoint", "option_files"}
     return found + [name for name in changed(earlier, now) if name not in whole]
 
@@ -272,10 +275,6 @@ def _decisive(protocol: Mapping[str, Any]) -> dict[str, Any]:
     return {**{name: value for name, value in protocol.items() if name not in reasons}, "gripper": rule}
 
 
-def _is_float32(precision: Mapping[str, str]) -> bool:
-    return set(precision.values()) == {"float32"}
-
-
 def software(precision: Mapping[str, str]) -> dict[str, Any]:
     """The settings that say what computes: saccade's version and instructions, and the versions of packages.
 
@@ -288,7 +287,7 @@ def software(precision: Mapping[str, str]) -> dict[str, Any]:
     return {
         "saccade": found["saccade"],
         "instruction_set": found["instruction_set"],
-        "dot_products": [] if _is_float32(precision) else found["dot_products"],
+        "dot_products": [] if is_float32(precision) else found["dot_products"],
         "packages": {name: _version(name) for name in PACKAGES},
     }
 

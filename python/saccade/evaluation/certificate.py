@@ -19,6 +19,7 @@ from saccade.errors import InputError
 from saccade.evaluation.prediction import noise_of
 from saccade.evaluation.recordings import Recordings, length_of, observation_at
 from saccade.evaluation.source import OPTION_FILES, Source, forget_policy, named
+from saccade.head.options import is_float32
 from saccade.policy.policy import Policy
 from saccade.robots import Normalizer
 
@@ -188,9 +189,10 @@ def check(certificate: Certificate, source: Source) -> list[Finding]:
     differences = [float(one.from_float32["normalized"]) for one in (certificate, here)]
     # What the certificate says of itself must not widen what it may differ by.
     most = max(TOLERANCE, 2 * min(differences))
+    exact = is_float32(certificate.options.get("precision", "float32"))
     other = [
         f"{name} {_shown(certificate.made_with.get(name))}"
-        for name in (EXACT if _is_float32(certificate.options) else EXACT + ROUNDED)
+        for name in (EXACT if exact else EXACT + ROUNDED)
         if certificate.made_with.get(name) != here.made_with[name]
     ]
     if not other:
@@ -247,7 +249,7 @@ def _certified(
     threaded = _actions(rethreaded.policy, data, places, seed, sampling)
     forget_policy()
     exact = together
-    if not _is_float32(options):
+    if not is_float32(options.get("precision", "float32")):
         plain = replace(source, options={**options, "precision": "float32"})
         exact = _actions(plain.policy, data, places, seed, sampling)
         forget_policy()
@@ -274,12 +276,6 @@ def _certified(
         equal_over_threads=together.tobytes() == threaded.tobytes(),
         threads=sorted((used, other)),
     )
-
-
-def _is_float32(options: Mapping[str, Any]) -> bool:
-    """Whether backbone and head compute in float32."""
-    precision = options.get("precision", "float32")
-    return set(precision.values() if isinstance(precision, Mapping) else [precision]) == {"float32"}
 
 
 def _sha256(content: bytes) -> str:

@@ -81,6 +81,11 @@ def precisions_of_parts(precision: str | Mapping[str, str]) -> dict[str, str]:
     return dict.fromkeys(PARTS, precision)
 
 
+def is_float32(precision: str | Mapping[str, str]) -> bool:
+    """Whether a policy of this precision, one name or one of each part, computes in float32 alone."""
+    return set(precision.values() if isinstance(precision, Mapping) else [precision]) == {"float32"}
+
+
 def noise_or_draw(noise: ArrayLike | None, seed: Any, shape: tuple[int, ...]) -> Float32Array:
     """The noise that sampling starts from: the given array, or standard normal float32 of this shape.
 

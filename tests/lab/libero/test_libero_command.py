@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 
 from saccade import cli
-from saccade._internal import hub
+from saccade._internal import hub, tokenizers
 from saccade.errors import InputError
 from saccade_lab.cli.libero import prepare
 from saccade_lab.libero import episodes, packages, suites
@@ -161,6 +161,24 @@ def test_other_machines_find_the_files(
     (tmp_path / "mine.json").write_text((tmp_path / "mine.json").read_text() + "\n")
     with pytest.raises(InputError, match=r"another run: other options\.data_config\. Choose"):
         prepare(args, Workers())
+
+
+def test_another_published_tokenizer_is_another_run(
+    made: list[StandIn], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A checkpoint without a tokenizer, for which that of its release is read."""
+    bare = shutil.copytree(checkpoint("n1.7"), tmp_path / "policy")
+    words = tmp_path / "words" / "tokenizer.json"
+    words.parent.mkdir()
+    (bare / "tokenizer.json").rename(words)
+    location = hub.Location(words.parent, "somebody/words", "a" * 40)
+    monkeypatch.setattr(tokenizers, "locate_published", lambda *rest, **more: location)
+    command = ["libero", str(bare), "--out", str(tmp_path / "out"), "--tasks", "0", "--trials"]
+    assert [cli.main([*command, trials]) for trials in ("1", "2")] == [0, 0]
+    assert sum(len(one.starts) for one in made) == 2
+    words.write_text(words.read_text() + "\n")
+    assert cli.main([*command, "2"]) == 2
+    assert "has episodes of another run: other options.tokenizer. " in capsys.readouterr().err
 
 
 def test_trials_beyond_the_official_states(

@@ -188,6 +188,16 @@ def test_records_of_before_dot_products_are_of_another_run(tmp_path: Path) -> No
     assert Results.begin(tmp_path, float32).episodes == filled().episodes
 
 
+def test_a_published_tokenizer_counts_where_it_was_recorded(tmp_path: Path) -> None:
+    now = changed(("options", "tokenizer"), None)
+    filled({**now, "option_files": {}}).write(tmp_path, ABOUT)  # as the first records have it
+    assert Results.begin(tmp_path, now).episodes == filled().episodes
+    filled(now).write(tmp_path, ABOUT)
+    other = {**now, "option_files": {"tokenizer": {"name": "words.json", "sha256": "1" * 64}}}
+    with pytest.raises(InputError, match=r"another run: other options\.tokenizer\. Choose"):
+        Results.begin(tmp_path, other)
+
+
 def test_names_do_not_matter_where_contents_are_equal(tmp_path: Path) -> None:
     filled().write(tmp_path, ABOUT)
     other = changed(("checkpoint", "name"), "renamed")
