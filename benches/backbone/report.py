@@ -23,7 +23,6 @@ GOALS = (
     ("saccade-int8", "bfloat16", 2.5, 4.0),
     ("saccade-float32", "float32", 1.2, 1.5),
 )
-FLOOR_GOALS = (0.80, 0.88)
 
 Results = dict[str, Any]
 

@@ -89,7 +89,7 @@ def test_the_demo_shows_what_the_policy_answers(capsys: pytest.CaptureFixture[st
     assert [list(map(float, row[:4])) for row in shown] == np.round(
         actions[[0, 5, 10, 15]].T.astype(np.float64), 2
     ).tolist()
-    assert [row[4] for row in shown] == [drawing.bars(row, -1.0, 1.0) for row in moment.actions.T.tolist()]
+    assert [row[4] for row in shown] == [drawing.bars(row) for row in moment.actions.T.tolist()]
     assert f'drawer-open: "{moment.instruction}"' in out
     assert all(name in out for name in moment.images)
     assert not ESCAPE.search(out)  # pytest's capture is no terminal

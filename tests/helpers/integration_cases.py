@@ -44,10 +44,6 @@ class Case:
         return self.head.config
 
     @property
-    def reads_masks(self) -> bool:
-        return bool(getattr(self.config, "use_alternate_vl_dit", False))
-
-    @property
     def takes_options(self) -> bool:
         return hasattr(self.head, "get_action_with_features")
 

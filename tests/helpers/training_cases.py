@@ -45,8 +45,7 @@ def recorded() -> Path:
     """Two demonstrations of two tasks; not to be changed."""
     out = Path(tempfile.mkdtemp(prefix="saccade-demos-"))
     atexit.register(shutil.rmtree, out)
-    for task in TASKS:
-        demos.record_task(task, 2, out, RECORDING, lambda: None)
+    demos.record_tasks(dict.fromkeys(TASKS, 2), out, RECORDING, lambda task: None)
     return out
 
 

@@ -238,7 +238,7 @@ def prepare(args: argparse.Namespace, workers: Workers) -> Session:
         "processes": {"backend": workers.backend, "jobs": workers.jobs},
     }
     if not args.json:
-        announce(policy, settings["protocol"])
+        announce(settings["protocol"])
     return Session(episodes, items, results, workers, args.out, about)
 
 
@@ -292,7 +292,7 @@ def check_trials(policy: LiberoPolicy, tasks: Iterable[Mapping[str, Any]], trial
             )
 
 
-def announce(policy: LiberoPolicy, protocol: Mapping[str, Any]) -> None:
+def announce(protocol: Mapping[str, Any]) -> None:
     """Prints the protocol."""
     from saccade_lab.libero.protocols import described
 

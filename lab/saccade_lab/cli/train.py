@@ -169,7 +169,7 @@ def run(args: argparse.Namespace) -> int:
     return EXIT_OK
 
 
-def training_settings(args: argparse.Namespace, *, on_libero: bool = False) -> TrainingSettings:
+def training_settings(args: argparse.Namespace, *, on_libero: bool) -> TrainingSettings:
     """The settings that the arguments ask for.
 
     Args:

@@ -26,7 +26,7 @@ def wider(
     found: Positions,
     radii: Mapping[str, float],
     fixed: str,
-    trade_share: float = TRADE_SHARE,
+    trade_share: float,
 ) -> dict[str, npt.NDArray[np.float64]]:
     """Positions of objects that differ more than those of LIBERO's own reset.
 
@@ -43,7 +43,7 @@ def wider(
 
     Example:
         >>> found = {"milk": np.zeros(2), "basket": np.array([0.0, 0.3])}
-        >>> moved = wider(np.random.default_rng(0), found, {"milk": 0.04, "basket": 0.1}, "basket")
+        >>> moved = wider(np.random.default_rng(0), found, {"milk": 0.04, "basket": 0.1}, "basket", 0.0)
         >>> all(np.abs(moved[name] - found[name]).max() <= SHIFT for name in found)
         True
     """

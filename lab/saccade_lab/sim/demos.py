@@ -326,13 +326,6 @@ def record_with(
         environment_cache.close()
 
 
-def record_task(
-    task: str, count: int, out: Path, settings: RecordingSettings, on_episode: Callable[[], None]
-) -> None:
-    """Records ``count`` episodes of one task in this process; see ``record_tasks``."""
-    record_tasks({task: count}, out, settings, lambda task: on_episode())
-
-
 def load(path: Path, *, images: bool = True) -> Demonstration:
     """Reads one episode, with or without its images. Without, ``images`` is ``(frames, 0, 0, 0, 3)``."""
     with np.load(path, allow_pickle=False) as arrays:  # reads an array when it is asked for

@@ -230,9 +230,10 @@ def loss_sensitivity(
     mask: Tensor,
     generator: torch.Generator,
     draws: int,
-    embodiment_id: int = 0,
 ) -> Sensitivity:
     """How the flow-matching loss of one observation, averaged over times and noises, depends on the rows.
+
+    The robot is the head's first embodiment.
 
     Args:
         head: Head that computes, in its dtype.
@@ -242,7 +243,6 @@ def loss_sensitivity(
         mask: Weights of the actions, ``(1, T, 1)``.
         generator: Generator of times and noise.
         draws: Number of times and noises.
-        embodiment_id: Embodiment of the robot.
 
     Returns:
         As ``action_sensitivity``, of the loss.
@@ -252,7 +252,7 @@ def loss_sensitivity(
         loss = head.loss(
             features.expand(draws, -1, -1),
             state.expand(draws, -1),
-            embodiment_id,
+            0,
             actions.expand(draws, -1, -1),
             noise=torch.randn(draws, *actions.shape[1:], generator=generator, dtype=head.dtype),
             time=head.sample_time(draws, generator),

@@ -108,11 +108,11 @@ def chart(actions: Float32Array, expert: Float32Array | None, columns: int) -> l
     lines = [heading.rstrip()]
     for number, name in enumerate(NUMBERS):
         values = actions[:, number].tolist()
-        course = drawing.bars(values, -1.0, 1.0) if with_bars else ""
+        course = drawing.bars(values) if with_bars else ""
         line = f"{name:<8}{course:<16}{values_at(values, shown)}"
         if expert is not None:
             other = expert[:, number].tolist()
-            line += "  " + (drawing.bars(other, -1.0, 1.0) if with_bars else values_at(other, ends))
+            line += "  " + (drawing.bars(other) if with_bars else values_at(other, ends))
         lines.append(line)
     return lines
 

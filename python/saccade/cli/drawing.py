@@ -120,17 +120,17 @@ def shaded(image: UInt8Array) -> list[str]:
     return ["".join(SHADES[number] for number in row) for row in index]
 
 
-def beside(pictures: Sequence[Sequence[str]], gap: str = "  ") -> list[str]:
+def beside(pictures: Sequence[Sequence[str]], gap: str) -> list[str]:
     """Pictures with equally many lines, side by side."""
     return [gap.join(row) for row in zip(*pictures, strict=True)]
 
 
-def bars(values: Sequence[float], low: float, high: float) -> str:
-    """A bar for each value; the lowest at `low` or below, the highest at `high` or above.
+def bars(values: Sequence[float]) -> str:
+    """A bar for each value; the lowest at -1 or below, the highest at 1 or above.
 
     Example:
-        >>> bars([-2.0, -1.0, 0.0, 1.0], -1.0, 1.0)
+        >>> bars([-2.0, -1.0, 0.0, 1.0])
         '▁▁▅█'
     """
-    scaled = (np.clip(values, low, high) - low) / (high - low) * len(BARS)
+    scaled = (np.clip(values, -1.0, 1.0) + 1.0) / 2.0 * len(BARS)
     return "".join(BARS[min(int(value), len(BARS) - 1)] for value in scaled)

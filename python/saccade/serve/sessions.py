@@ -85,16 +85,16 @@ class Sessions:
                 self._sessions.popitem(last=False)
             return session
 
-    def reset(self, name: str | int | None, owner: Hashable) -> int:
-        """Forgets a session, or without a name those that a connection used last; returns how many."""
+    def reset(self, name: str | int | None, owner: Hashable) -> None:
+        """Forgets a session, if there is one; without a name those that a connection used last."""
         with self._lock:
             self._forget_old()
             if name is not None:
-                return int(self._sessions.pop(name, None) is not None)
+                self._sessions.pop(name, None)
+                return
             owned = [key for key, session in self._sessions.items() if session.owner is owner]
             for key in owned:
                 del self._sessions[key]
-            return len(owned)
 
     def _forget_old(self) -> None:
         oldest = self._clock() - self._most_seconds

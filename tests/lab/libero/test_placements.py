@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from saccade_lab.libero.placements import GAP, SHIFT, is_free, wider
+from saccade_lab.libero.placements import GAP, SHIFT, TRADE_SHARE, is_free, wider
 
 FOUND = {
     "milk": np.array([-0.12, -0.24]),
@@ -20,7 +20,7 @@ RADII = {"milk": 0.037, "butter": 0.043, "soup": 0.044, "basket": 0.116, "parked
 def test_objects_move_by_centimetres_and_sometimes_trade_places() -> None:
     traded, shifts = 0, []
     for seed in range(300):
-        moved = wider(np.random.default_rng(seed), FOUND, RADII, "basket")
+        moved = wider(np.random.default_rng(seed), FOUND, RADII, "basket", TRADE_SHARE)
         assert set(moved) == {"milk", "butter", "soup", "basket"}  # the parked one stays where it is
         places = {
             name: min(FOUND, key=lambda other: np.abs(FOUND[other] - moved[name]).max()) for name in moved
@@ -39,13 +39,13 @@ def test_objects_move_by_centimetres_and_sometimes_trade_places() -> None:
 
 
 def test_the_same_seed_gives_the_same_places() -> None:
-    one, other = (wider(np.random.default_rng(7), FOUND, RADII, "basket") for _ in range(2))
+    one, other = (wider(np.random.default_rng(7), FOUND, RADII, "basket", TRADE_SHARE) for _ in range(2))
     assert all(np.array_equal(one[name], other[name]) for name in one)
 
 
 def test_without_room_objects_stay() -> None:
     found = {"milk": np.zeros(2), "soup": np.array([0.01, 0.0])}
-    moved = wider(np.random.default_rng(0), found, {"milk": 0.5, "soup": 0.5}, "basket")
+    moved = wider(np.random.default_rng(0), found, {"milk": 0.5, "soup": 0.5}, "basket", TRADE_SHARE)
     assert all(np.array_equal(moved[name], found[name]) for name in found)
 
 

@@ -53,17 +53,17 @@ def test_recording_goes_on_where_it_stopped(recording: Path, tmp_path: Path) -> 
     class StoppedError(Exception):
         pass
 
-    def stop() -> None:
+    def stop(task: str) -> None:
         raise StoppedError
 
     with pytest.raises(StoppedError):
-        demos.record_task("reach", 2, tmp_path, RECORDING, stop)
+        demos.record_tasks({"reach": 2}, tmp_path, RECORDING, stop)
     first = sorted((tmp_path / "reach").glob("*.npz"))
     written = first[0].stat().st_mtime_ns
     assert len(first) == 1
-    episodes = []
-    demos.record_task("reach", 2, tmp_path, RECORDING, lambda: episodes.append(1))
-    assert len(episodes) == 2
+    episodes: list[str] = []
+    demos.record_tasks({"reach": 2}, tmp_path, RECORDING, episodes.append)
+    assert episodes == ["reach", "reach"]
     assert first[0].stat().st_mtime_ns == written
     both = zip(demos.episodes(recording, "reach"), demos.episodes(tmp_path, "reach"), strict=True)
     for (seed, whole), (other_seed, resumed) in both:
@@ -97,7 +97,7 @@ def test_recording_with_other_settings_is_refused(recording: Path) -> None:
     with pytest.raises(
         InputError, match=r"reach: has results with other settings \(image_size, frame_stride changed\)"
     ):
-        demos.record_task("reach", 3, recording, other, lambda: None)
+        demos.record_tasks({"reach": 3}, recording, other, lambda task: None)
 
 
 @pytest.mark.parametrize(
@@ -120,7 +120,7 @@ def test_damaged_settings_are_named(
     with pytest.raises(InputError, match=rf"^{re.escape(str(first))}: {problem}.*\Z"):
         demos.read_settings(out, TASKS)
     with pytest.raises(InputError, match=re.escape(str(first.parent))):
-        demos.record_task(TASKS[0], 2, out, RECORDING, lambda: None)
+        demos.record_tasks({TASKS[0]: 2}, out, RECORDING, lambda task: None)
 
 
 def test_chunks_stop_counting_after_a_disturbance_and_at_the_end() -> None:

@@ -127,7 +127,7 @@ def test_every_ball_is_drawn_where_it_is(task: str) -> None:
 @pytest.mark.parametrize("task", NAMES)
 def test_recordings_use_seeds_of_their_own(task: str, tmp_path: Path) -> None:
     settings = demos.RecordingSettings(image_size=16)
-    demos.record_task(task, 2, tmp_path, settings, lambda: None)
+    demos.record_tasks({task: 2}, tmp_path, settings, lambda task: None)
     seeds = [seed for seed, _ in demos.episodes(tmp_path, task)]
     assert len(seeds) == 2
     assert set(seeds) <= set(DEMONSTRATION_SEEDS)

@@ -184,7 +184,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two demonstrations as the shipped policy would see them."""
     out = tmp_path_factory.mktemp("demos")
     settings = demos.RecordingSettings(frame_stride=12, cameras=DEFAULT_CAMERAS)
-    demos.record_task(TASK, 2, out, settings, lambda: None)
+    demos.record_tasks({TASK: 2}, out, settings, lambda task: None)
     return out
 
 
@@ -252,6 +252,6 @@ def test_bad_input(recording: Path, tmp_path: Path, capsys: pytest.CaptureFixtur
     assert "projections: given -1" in refused("--projections", "-1")
     assert "has none of reach" in refused("--tasks", "reach", "--demos", str(recording))
     other = demos.RecordingSettings(image_size=16, frame_stride=12, cameras=DEFAULT_CAMERAS[:1])
-    demos.record_task(TASK, 1, tmp_path / "other", other, lambda: None)
+    demos.record_tasks({TASK: 1}, tmp_path / "other", other, lambda task: None)
     assert "another image size" in refused("--tasks", TASK, "--demos", str(tmp_path / "other"))
     assert not (tmp_path / "out").exists()

@@ -70,7 +70,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two demonstrations of one task with small pictures."""
     out = tmp_path_factory.mktemp("demos")
     settings = demos.RecordingSettings(image_size=16, frame_stride=12, cameras=DEFAULT_CAMERAS[:1])
-    demos.record_task(TASK, 2, out, settings, lambda: None)
+    demos.record_tasks({TASK: 2}, out, settings, lambda task: None)
     return out
 
 

@@ -37,8 +37,7 @@ HEAD = dataclasses.replace(BACKBONE, only="head", absent_share=0.0, num_layers=3
 def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A demonstration of two tasks."""
     out = tmp_path_factory.mktemp("demos")
-    for task in TASKS:
-        demos.record_task(task, 1, out, RECORDING, lambda: None)
+    demos.record_tasks(dict.fromkeys(TASKS, 1), out, RECORDING, lambda task: None)
     return out
 
 

@@ -218,7 +218,7 @@ def pictures(prose: Prose, results: Mapping[str, ModeResult]) -> list[Figure]:
         }
         if success:
             caption = prose.line("caption_frontier", SIZES[size])
-            picture = scattered(success, "milliseconds per chunk", "success, %")
+            picture = scattered(success, "success, %")
             found.append(Figure(f"frontier-{size.replace('.', '')}", caption, picture))
     for size in timed_sizes(results)[:1]:
         errors = {
@@ -228,19 +228,19 @@ def pictures(prose: Prose, results: Mapping[str, ModeResult]) -> list[Figure]:
         }
         if errors:
             caption = prose.line("caption_errors", SIZES[size])
-            picture = scattered(errors, "milliseconds per chunk", "|difference| of an action", falling=True)
+            picture = scattered(errors, "|difference| of an action", falling=True)
             found.append(Figure("errors", caption, picture))
     return found
 
 
 def scattered(
-    measured: Mapping[str, tuple[Estimate, Estimate]], x_label: str, y_label: str, *, falling: bool = False
+    measured: Mapping[str, tuple[Estimate, Estimate]], y_label: str, *, falling: bool = False
 ) -> Picture:
     """Points with error bars over a logarithmic time axis, numbered by time; a line connects the frontier.
 
     Args:
-        measured: Time and value of each name.
-        x_label, y_label: Labels of the axes, with units.
+        measured: Milliseconds per chunk, and value, of each name.
+        y_label: Label of the values' axis, with units.
         falling: Small values are good, and the vertical axis is logarithmic too.
     """
     picture, (axes,) = figures.new_picture(height=4.6)
@@ -284,7 +284,7 @@ def scattered(
     axes.tick_params(axis="x", which="both", labelsize=7)
     if falling:
         axes.set_yscale("log")
-    axes.set_xlabel(x_label)
+    axes.set_xlabel("milliseconds per chunk")
     axes.set_ylabel(y_label)
     axes.grid(color="0.9")
     axes.set_axisbelow(True)
