@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import concurrent.futures
 import os
-import signal
 import subprocess
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 
 import numpy as np
 import pytest
 
 import saccade
+from tests.helpers.interrupts import Stopped, stopped_after
 from tests.helpers.released_backbones import DATA, released_backbone
 
 
@@ -45,29 +43,6 @@ def test_a_forked_process_has_the_same_features() -> None:
         ]
         os._exit(0 if all(same) else 1)
     assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
-
-
-class Stopped(Exception):
-    """What the signal's handler raises."""
-
-
-@contextmanager
-def stopped_after(seconds: float) -> Iterator[None]:
-    """Raises `Stopped` in the main thread once this long has passed.
-
-    And every two seconds after that: Python drops what is raised within a callback of its garbage collector.
-    """
-
-    def stop(*_: object) -> None:
-        raise Stopped
-
-    before = signal.signal(signal.SIGALRM, stop)
-    signal.setitimer(signal.ITIMER_REAL, seconds, 2.0)
-    try:
-        yield
-    finally:
-        signal.setitimer(signal.ITIMER_REAL, 0)
-        signal.signal(signal.SIGALRM, before)
 
 
 def test_calls_are_stopped_and_the_backbone_stays_usable() -> None:

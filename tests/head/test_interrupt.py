@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import collections
 import itertools
-import signal
 import threading
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -17,31 +15,9 @@ from safetensors.numpy import save_file
 
 import saccade
 from saccade import _saccade
+from tests.helpers.interrupts import Stopped, stopped_after
 
 DEMO = str(saccade.demo_checkpoint())
-
-
-class Stopped(Exception):
-    """What the signal's handler raises."""
-
-
-@contextmanager
-def stopped_after(seconds: float) -> Iterator[None]:
-    """Raises `Stopped` in the main thread once this long has passed.
-
-    And every two seconds after that: Python drops what is raised within a callback of its garbage collector.
-    """
-
-    def stop(*_: object) -> None:
-        raise Stopped
-
-    before = signal.signal(signal.SIGALRM, stop)
-    signal.setitimer(signal.ITIMER_REAL, seconds, 2.0)
-    try:
-        yield
-    finally:
-        signal.setitimer(signal.ITIMER_REAL, 0)
-        signal.signal(signal.SIGALRM, before)
 
 
 @pytest.fixture(scope="module")

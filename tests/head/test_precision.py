@@ -20,7 +20,7 @@ from saccade import _saccade
 from saccade.errors import DtypeError, InputError
 from saccade_lab.reference import ActionHead as Reference
 from saccade_lab.reference.random_weights import random_head, random_inputs
-from tests.helpers.engine_cases import arrays, save
+from tests.helpers.engine_cases import arrays, rms, save
 from tests.helpers.int4_cases import HEAD_BLOCKS, with_int4_weights
 from tests.helpers.reference_cases import small_config
 from tests.helpers.released import Released
@@ -50,10 +50,6 @@ def isa(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
 @pytest.fixture(params=PRECISIONS)
 def precision(request: pytest.FixtureRequest) -> str:
     return str(request.param)
-
-
-def rms(values: NDArray[np.float64]) -> float:
-    return float(np.sqrt(np.mean(np.square(values))))
 
 
 def head_of(folder: Path, reference: Reference, config: dict[str, Any], **options: Any) -> saccade.ActionHead:

@@ -21,16 +21,13 @@ from torch import Tensor
 from saccade import Intervention
 from saccade_lab.reference import ActionHead
 from saccade_lab.reference.random_weights import random_head, random_inputs
+from tests.helpers.intervention_loops import assert_close
 from tests.helpers.reference_cases import small_config
 
 small_settings = settings(max_examples=10, deadline=None)
 seeds = st.integers(0, 2**31 - 1)
 NOT_READ = Intervention(cut=[("state", "future"), ("action", "future")])
 NO_TOKENS = Intervention(future_tokens=np.empty((0, 12), np.float32))
-
-
-def assert_close(given: Tensor, expected: Tensor, tolerance: float = 1e-12) -> None:
-    torch.testing.assert_close(given, expected, rtol=tolerance, atol=tolerance)
 
 
 def head_and_inputs(seed: int, *, batch: int = 2, **config: Any) -> tuple[ActionHead, dict[str, Tensor]]:

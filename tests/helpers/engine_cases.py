@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 from safetensors.torch import save_file
 from torch import Tensor
 
@@ -148,3 +149,8 @@ def three_observations(head: saccade.ActionHead) -> dict[str, Any]:
         "embodiment_id": [1, 0, 1],
         "noise": rng.standard_normal((3, config.action_horizon, config.encoder_action_dim), np.float32),
     }
+
+
+def rms(values: NDArray[np.float64]) -> float:
+    """The root of the mean square."""
+    return float(np.sqrt(np.mean(np.square(values))))

@@ -90,3 +90,18 @@ def inputs_of(policy: Policy, observation: Any) -> list[BackboneInputs]:
     """The backbone's inputs for each row of observations."""
     assert policy.processor is not None
     return prepare_inputs(read_observations(observation, policy.requirements), policy.processor)
+
+
+def noise(policy: Policy, count: int = 1) -> NDArray[np.float32]:
+    """The same noise for as many rows, ``(count, action_horizon, encoder_action_dim)``."""
+    config = policy.head.config
+    shape = (count, config.action_horizon, config.encoder_action_dim)
+    return np.random.default_rng(1).standard_normal(shape, dtype=np.float32)
+
+
+def with_parts(policy: Any, **parts: Any) -> Policy:
+    """The policy with other parts."""
+    kept = {name: getattr(policy, name) for name in ("head", "backbone", "processor")} | parts
+    return Policy(
+        kept.pop("head"), policy.normalizer, policy.embodiment_id, requirements=policy.requirements, **kept
+    )

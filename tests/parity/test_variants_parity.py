@@ -20,7 +20,6 @@ import pytest
 import torch
 from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 from torch import Tensor
 
 import saccade
@@ -34,6 +33,7 @@ from tests.helpers.engine_cases import (
     arrays,
     both,
     random_masks,
+    rms,
     same,
     save,
     variant_configs,
@@ -247,10 +247,6 @@ def rounded(reference: Reference, precision: str) -> Reference:
         if re.fullmatch(rf"({VL}|{DIT})attn1\.to_[qkv]", name):
             module.register_forward_hook(lambda _, args, output: bfloat16(output))
     return reference
-
-
-def rms(values: NDArray[np.float64]) -> float:
-    return float(np.sqrt(np.mean(np.square(values))))
 
 
 @pytest.mark.parametrize("precision", ["bfloat16", "int8", "int4"])

@@ -16,7 +16,7 @@ import saccade
 from saccade import BackboneInputs, Policy, PolicyContext, ShapeError
 from saccade.policy.encoding import compute_features, encode_features
 from tests.helpers import whole_checkpoints
-from tests.helpers.policy_cases import inputs_of
+from tests.helpers.policy_cases import inputs_of, noise, with_parts
 from tests.helpers.whole_checkpoints import EMBODIMENT, whole
 
 Observation = dict[str, Any]
@@ -41,14 +41,6 @@ def load(layout: str, num_threads: int = 1) -> Any:
     return Policy.from_pretrained(whole(layout), embodiment=EMBODIMENT, num_threads=num_threads)
 
 
-def with_parts(policy: Any, **parts: Any) -> Policy:
-    """The policy with other parts."""
-    kept = {name: getattr(policy, name) for name in ("head", "backbone", "processor")} | parts
-    return Policy(
-        kept.pop("head"), policy.normalizer, policy.embodiment_id, requirements=policy.requirements, **kept
-    )
-
-
 def separately(policy: Any) -> Policy:
     """The policy whose parts are called one after the other, with arrays between them."""
     return with_parts(policy, backbone=ForeignBackbone(policy.backbone))
@@ -57,12 +49,6 @@ def separately(policy: Any) -> Policy:
 def seen(policy: Policy, text: str = "push the button", seed: int = 0) -> Observation:
     example = policy.example_observation(seed)
     return example | {"language": {key: [[text]] for key in example["language"]}}
-
-
-def noise(policy: Policy, count: int) -> np.ndarray[Any, Any]:
-    config = policy.head.config
-    shape = (count, config.action_horizon, config.encoder_action_dim)
-    return np.random.default_rng(1).standard_normal(shape, dtype=np.float32)
 
 
 def assert_same_context(found: PolicyContext, expected: PolicyContext) -> None:

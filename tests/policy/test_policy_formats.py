@@ -16,7 +16,7 @@ import saccade
 from saccade import DtypeError, InputError, Policy, ShapeError
 from saccade.observations import Requirements, read
 from tests.helpers import whole_checkpoints
-from tests.helpers.policy_cases import inputs_of, policy
+from tests.helpers.policy_cases import inputs_of, noise, policy
 
 Observation = dict[str, Any]
 
@@ -64,12 +64,6 @@ def row(observation: Observation, index: int) -> Observation:
         key: row(value, index) if isinstance(value, dict) else value[index]
         for key, value in observation.items()
     }
-
-
-def noise(made: Policy, batch: int) -> np.ndarray[Any, Any]:
-    config = made.head.config
-    shape = (batch, config.action_horizon, config.encoder_action_dim)
-    return np.random.default_rng(1).standard_normal(shape, dtype=np.float32)
 
 
 @pytest.mark.parametrize("layout", whole_checkpoints.LAYOUTS)

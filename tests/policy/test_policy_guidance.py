@@ -15,6 +15,7 @@ import pytest
 import saccade
 from saccade import BackboneInputs, InputError, Intervention, Policy
 from tests.helpers import whole_checkpoints
+from tests.helpers.policy_cases import noise, with_parts
 from tests.helpers.whole_checkpoints import EMBODIMENT, whole
 
 Observation = dict[str, Any]
@@ -44,19 +45,6 @@ def told(policy: Policy, text: str | None = "push the button", seed: int = 0) ->
 def same(found: Any, expected: Any) -> bool:
     assert found.keys() == expected.keys()
     return all(np.array_equal(found[key], expected[key]) for key in expected)
-
-
-def noise(policy: Policy, count: int = 1) -> np.ndarray[Any, Any]:
-    config = policy.head.config
-    shape = (count, config.action_horizon, config.encoder_action_dim)
-    return np.random.default_rng(1).standard_normal(shape, dtype=np.float32)
-
-
-def with_parts(policy: Any, **parts: Any) -> Policy:
-    kept = {name: getattr(policy, name) for name in ("head", "backbone", "processor")} | parts
-    return Policy(
-        kept.pop("head"), policy.normalizer, policy.embodiment_id, requirements=policy.requirements, **kept
-    )
 
 
 class Counted:

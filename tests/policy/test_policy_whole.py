@@ -18,7 +18,7 @@ from safetensors.torch import load_file, save_file
 import saccade
 from saccade import CheckpointError, InputError, Policy, PolicyContext
 from tests.helpers import layouts, whole_checkpoints
-from tests.helpers.policy_cases import inputs_of
+from tests.helpers.policy_cases import inputs_of, noise
 from tests.helpers.whole_checkpoints import EMBODIMENT, whole
 
 Observation = dict[str, Any]
@@ -42,12 +42,6 @@ def told(policy: Policy, instruction: str, seed: int = 0) -> Observation:
 def same(found: dict[str, Any], expected: dict[str, Any]) -> bool:
     assert list(found) == list(expected)
     return all(np.array_equal(found[key], expected[key]) for key in expected)
-
-
-def noise(policy: Policy, count: int) -> np.ndarray[Any, Any]:
-    config = policy.head.config
-    shape = (count, config.action_horizon, config.encoder_action_dim)
-    return np.random.default_rng(1).standard_normal(shape, dtype=np.float32)
 
 
 @pytest.mark.parametrize("layout", whole_checkpoints.LAYOUTS)
