@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 import numbers
+import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -116,6 +117,6 @@ def check_ramp_rate(name: str, value: object) -> float:
         InputError: It is not a finite number above 0.
     """
     is_number = isinstance(value, numbers.Real) and not isinstance(value, bool)
-    if not is_number or not 0 < value < math.inf:  # type: ignore[operator]
+    if not is_number or not 0 < value <= sys.float_info.max:  # type: ignore[operator]
         raise InputError(f"{name}: expected a finite number above 0, got {value!r:.100}")
     return float(value)  # type: ignore[arg-type]
