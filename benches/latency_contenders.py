@@ -74,7 +74,7 @@ class Contenders:
     def _answer(self, name: str) -> Any:
         try:
             answer = self._pipes[name].recv()
-        except EOFError:
+        except (EOFError, OSError):
             raise RuntimeError(f"{name}: its process ended, perhaps for lack of memory") from None
         if isinstance(answer, Exception):
             raise answer

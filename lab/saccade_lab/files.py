@@ -9,8 +9,21 @@ from pathlib import Path
 from typing import Any
 
 from saccade._internal.files import sha256_of
-from saccade._internal.hub_files import STATISTICS
+from saccade._internal.hub_files import TOKENIZER
+from saccade._internal.tokenizers import tokenizer_path
+from saccade.evaluation.source import contents_hash
 from saccade.robots.data_configs import RELEASED
+
+#: Files whose hash is that of a checkpoint, besides the tensors.
+COMPANIONS = (
+    *("config.json", "tokenizer.json"),
+    *("experiment_cfg/metadata.json", "experiment_cfg/data_config.json"),
+)
+#: Files of N1.6, N1.7 and lerobot that say how observations and actions are converted.
+CONVERSIONS = (
+    *("processor_config.json", "statistics.json", "dataset_statistics.json", "embodiment_id.json"),
+    *("processor/*.json", "policy_*processor*.json", "preprocessor_config.json"),
+)
 
 
 def path_text(path: Path) -> str:
@@ -40,51 +53,56 @@ def writable_directory(path: Path) -> Path:
 
 
 def checkpoint_identity(checkpoint: Path) -> dict[str, str]:
-    """``name`` and ``sha256`` of a checkpoint.
+    """``name`` and ``sha256`` of a checkpoint, and ``robot_sha256`` of one of N1.6, N1.7 or lerobot.
 
-    The hash covers the tensors and what decides how they are used: config, tokenizer, statistics and what an
-    observation must contain, where there are such files.
+    The first hash covers the tensors, and the config, tokenizer and statistics that a policy of N1.5 has. The
+    second covers the files of the others that say how observations and actions are converted.
     """
     directory = checkpoint if checkpoint.is_dir() else checkpoint.parent
     tensors = sorted(directory.glob("*.safetensors")) if checkpoint.is_dir() else [checkpoint]
-    companions = [
-        directory / name
-        for name in (
-            "config.json",
-            "tokenizer.json",
-            "experiment_cfg/metadata.json",
-            "experiment_cfg/data_config.json",
-        )
-    ]
-    # After the others, so that checkpoints without these files keep the hash that their records have.
-    found = {one for pattern in STATISTICS for one in directory.glob(pattern)}
-    return {
+    companions = [directory / name for name in COMPANIONS]
+    found = {
         "name": checkpoint.resolve().name,
-        "sha256": sha256_of(
-            *filter(Path.is_file, companions), *tensors, *sorted(found.difference(companions, tensors))
-        ),
+        "sha256": sha256_of(*filter(Path.is_file, companions), *tensors),
     }
+    if any(path.is_file() for pattern in CONVERSIONS for path in directory.glob(pattern)):
+        found["robot_sha256"] = contents_hash(directory, CONVERSIONS)
+    return found
 
 
-def overrides(
-    data_config: str | None, action_horizon: int | None, processor_options: Mapping[str, Any] | None
+def data_config_text(given: str | None) -> str | None:
+    """A data config as text: a released name as it is, a path with a separator."""
+    return given if given is None or given in RELEASED else path_text(Path(given))
+
+
+def loading_identity(
+    checkpoint: Path,
+    tokenizer: str | Path | None,
+    data_config: str | None,
+    action_horizon: int | None,
+    processor_options: Mapping[str, Any] | None,
 ) -> dict[str, Any]:
-    """What a record says of these options of ``saccade.Policy.from_pretrained``: those that are given.
+    """What a record says of these options of ``saccade.Policy.from_pretrained``: those that decide something.
 
-    A data config is its released name, or the hash of its file.
+    Files are hashes. The tokenizer is the one that is read in place of the checkpoint's own.
 
     Example:
-        >>> overrides("so100", None, None)
+        >>> from saccade import demo_checkpoint
+        >>> loading_identity(demo_checkpoint(), None, "so100", None, None)
         {'data_config': 'so100'}
     """
-    found: dict[str, Any] = {
-        "data_config": data_config,
-        "action_horizon": action_horizon,
-        "processor_options": None if processor_options is None else dict(processor_options),
-    }
-    if data_config is not None and data_config not in RELEASED:
-        found["data_config"] = {"sha256": sha256_of(Path(data_config))}
-    return {name: value for name, value in found.items() if value is not None}
+    found: dict[str, Any] = {}
+    path = tokenizer_path(checkpoint, tokenizer)
+    if path is not None:
+        found["tokenizer"] = {"sha256": contents_hash(path, TOKENIZER)}
+    if data_config is not None:
+        is_name = data_config in RELEASED
+        found["data_config"] = data_config if is_name else {"sha256": sha256_of(Path(data_config))}
+    if action_horizon is not None:
+        found["action_horizon"] = action_horizon
+    if processor_options is not None:
+        found["processor_options"] = dict(processor_options)
+    return found
 
 
 def changed(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import warnings
+from fractions import Fraction
 from typing import Any
 
 import numpy as np
@@ -12,6 +14,7 @@ from hypothesis import strategies as st
 
 import saccade
 from saccade import Chunking, InputError, ShapeError
+from saccade.head.chunking import RELEASED, from_released
 from saccade_lab.reference import ActionHead as Reference
 from saccade_lab.reference.chunking import velocity_strength
 from saccade_lab.reference.random_weights import random_inputs
@@ -203,3 +206,22 @@ def test_it_differs_from_what_starts_anew(isa: str) -> None:
     independent = np.asarray(head(**inputs))
     on = np.asarray(head(**inputs, previous_chunk=previous, chunking=Chunking(3, 3)))
     assert not same(on[:, 3:], independent[:, 3:])
+
+
+@pytest.mark.parametrize(
+    "rate",
+    [np.float32("inf"), np.float16("inf"), np.float32("nan"), 10**400, Fraction(1, 10**400), -1, True, "2"],
+)
+def test_released_ramp_rates_that_are_refused(rate: Any) -> None:
+    released = dict(zip(RELEASED, (6, 4, 2, rate), strict=True))
+    with pytest.raises(InputError, match="options: rtc_ramp_rate: expected a finite number above 0, got"):
+        from_released(released)
+
+
+@pytest.mark.parametrize("rate", [np.float32(2.5), np.float64(2.5), 2.5, Fraction(5, 2)])
+def test_released_numbers_are_read_without_a_warning(rate: Any) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        found = from_released(dict(zip(RELEASED, (np.int64(6), 4, 2, rate), strict=True)))
+    assert found == saccade.Chunking(4, 2, ramp_rate=2.5, horizon=6)
+    assert type(found.ramp_rate) is float

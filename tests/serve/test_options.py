@@ -339,6 +339,8 @@ def test_modality_configs_of_a_data_config() -> None:
     plain = {name: one["as_json"] for name, one in modalities.answers(policy)["map"].items()}
     assert plain["video"] == {"delta_indices": [-3, 0], "modality_keys": ["wrist", "front"]}
     assert plain["language"] == text["language"]
+    policy.normalizer.action_horizon = 2  # fewer than are denoised, as lerobot policies may say
+    assert modalities.answers(policy)["map"]["action"]["as_json"]["delta_indices"] == [0, 2]
 
 
 def test_modality_configs_of_fewer_actions_than_lerobot_says() -> None:

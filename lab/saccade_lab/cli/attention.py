@@ -13,7 +13,7 @@ from saccade._internal.flags import UsageError, flags_given
 from saccade.cli import EXIT_OK, output
 from saccade_lab import flags as lab_flags
 from saccade_lab.extras import LAB, require
-from saccade_lab.files import overrides, writable_directory
+from saccade_lab.files import loading_identity, writable_directory
 
 if TYPE_CHECKING:
     from saccade.head.config import HeadConfig
@@ -287,7 +287,9 @@ def take_frames(args: argparse.Namespace, checkpoint: Path) -> tuple[ActionHead,
             "embodiment_id": policy.embodiment_id,
             "precision": args.precision or "float32",
             "preprocessing": parts.processor.preprocessing,
-            **overrides(args.data_config, args.action_horizon, args.processor_options),
+            **loading_identity(
+                checkpoint, args.tokenizer, args.data_config, args.action_horizon, args.processor_options
+            ),
             "noise": f"seed {args.seed}",
         },
     )

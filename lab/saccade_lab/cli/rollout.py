@@ -16,7 +16,7 @@ from saccade._internal.flags import add_data_config, add_overrides
 from saccade.cli import EXIT_INTERRUPTED, EXIT_OK, output
 from saccade_lab import flags as lab_flags
 from saccade_lab.extras import LAB, require
-from saccade_lab.files import path_text, writable_directory
+from saccade_lab.files import data_config_text, path_text, writable_directory
 from saccade_lab.parallel import Lost, Workers, check_lost, each
 from saccade_lab.parallel.arguments import workers_of
 
@@ -123,13 +123,14 @@ class Session:
 
     def run(self, on_episode: Callable[[Rolled], None]) -> None:
         """Runs all episodes and writes the result file after each of them, in the order of one process."""
+        from saccade.robots.data_configs import RELEASED
         from saccade_lab.sim.episodes import Rolled
 
         items = [(task, seed) for task in self.tasks for seed in self.seeds]
         order = {item: position for position, item in enumerate(items)}
         files = [self.episodes.checkpoint]
         config = self.episodes.data_config
-        if config is not None and Path(config).is_file():
+        if config is not None and config not in RELEASED:
             files.append(config)
         for (task, seed), rolled in each(self.episodes, items, self.workers, files):
             if isinstance(rolled, Lost):
@@ -202,7 +203,7 @@ def prepare(args: argparse.Namespace, seeds: range, workers: Workers) -> Session
         num_threads,
         args.instruction_from,
         args.video,
-        args.data_config,
+        data_config_text(args.data_config),
         args.action_horizon,
         None if args.processor_options is None else json.dumps(args.processor_options),
         args.record is not None,

@@ -102,7 +102,7 @@ class Results:
         path = folder / RESULTS
         if not path.is_file():
             return cls(settings)
-        record = read_json(path)
+        record = read_json(path, InputError)
         try:
             episodes = [
                 _checked(Episode(**episode, **cost), record["protocol"]["max_steps"])

@@ -359,7 +359,7 @@ def read_settings(directory: Path, tasks: Sequence[str]) -> RecordingSettings:
         raise InputError(f"{directory}: the tasks were recorded with different settings")
     try:
         return RecordingSettings.from_dict(found[0])
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, OverflowError, TypeError, ValueError) as error:
         raise InputError(f"{files[0]}: settings of an unknown form ({error!r})") from None
 
 

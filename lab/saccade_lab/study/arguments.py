@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from saccade._internal.hub import resolve
 from saccade.errors import InputError
-from saccade_lab.files import path_text
+from saccade_lab.files import data_config_text, path_text
 from saccade_lab.flags import check_frames, check_tasks
 from saccade_lab.parallel.arguments import workers_of
 from saccade_lab.study.pictures import PictureSource
@@ -97,7 +97,7 @@ def pictures_of(args: argparse.Namespace) -> PictureSource:
         precision=args.precision or "float32",
         preprocessing=args.preprocessing,
         tokenizer=None if args.tokenizer is None else path_text(args.tokenizer),
-        data_config=args.data_config,
+        data_config=data_config_text(args.data_config),
         action_horizon=args.action_horizon,
         processor_options=None if args.processor_options is None else json.dumps(args.processor_options),
         seed=args.seed,

@@ -21,7 +21,8 @@ from saccade.observations import read
 from saccade.observations.pictures import PictureObservation, read_frames
 from saccade.policy.encoding import pad_tokens
 from saccade.policy.policy import Policy
-from saccade_lab.files import checkpoint_identity, overrides
+from saccade.robots.data_configs import RELEASED
+from saccade_lab.files import checkpoint_identity, loading_identity
 from saccade_lab.head_inputs import HeadInputs
 from saccade_lab.inside import context_of, features_of, head_inputs, inputs_of, parts_of
 from saccade_lab.maps.grid import layout_of
@@ -74,7 +75,8 @@ class PictureSource(Recorded):
     @property
     def files(self) -> tuple[str, ...]:
         """See ``Source``."""
-        read = (self.frames, self.other_frames, self.state, self.tokenizer, self.data_config)
+        config = None if self.data_config in RELEASED else self.data_config
+        read = (self.frames, self.other_frames, self.state, self.tokenizer, config)
         return (*super().files, *(path for path in read if path is not None and Path(path).exists()))
 
     @property
@@ -93,7 +95,13 @@ class PictureSource(Recorded):
                 "noise": f"{NOISES} draws an observation",
                 "precision": self.precision,
                 "preprocessing": encoded.preprocessing,
-                **overrides(self.data_config, self.action_horizon, self._processor_options),
+                **loading_identity(
+                    Path(self.checkpoint),
+                    self.tokenizer,
+                    self.data_config,
+                    self.action_horizon,
+                    self._processor_options,
+                ),
                 "embodiment_id": int(encoded.observation.embodiment_id[0]),
                 "action_width": encoded.action_width,
                 "other": other,

@@ -43,10 +43,10 @@ def snapshot_of(name: str, commit: str, kind: str) -> Path:
     return _repository(name, kind) / "snapshots" / commit
 
 
-def write_revision(name: str, revision: str, commit: str) -> None:
+def write_revision(name: str, revision: str, commit: str, kind: str = "model") -> None:
     """Records which commit a revision was when it was downloaded, as ``huggingface_hub`` does."""
     if revision != commit:
-        _write(_repository(name) / "refs" / revision, commit)
+        _write(_repository(name, kind) / "refs" / revision, commit)
 
 
 def read_listing(folder: Path) -> list[str] | None:

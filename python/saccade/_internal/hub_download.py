@@ -5,7 +5,7 @@ from __future__ import annotations
 import glob
 import importlib.util
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -102,16 +102,17 @@ def download_dataset(name: str, revision: str | None, argument: str) -> Path:
     SACCADE.require("huggingface_hub")
     from huggingface_hub import snapshot_download
 
-    revision = revision or "main"
-    try:
+    revision = commit = revision or "main"
+    unfinished = f"no such path{neighbour(name)}, and it cannot be downloaded ({{}})"
+    # If the Hub refuses, so does `snapshot_download`, except for what is in the cache.
+    with suppress(Offline, FileNotFoundError, PermissionError):
         commit, listed = list_files(name, revision, argument, kind="dataset")
         # Before the download, which may be interrupted.
         hub_cache.write_listing(hub_cache.snapshot_of(name, commit, "dataset"), listed)
+        hub_cache.write_revision(name, revision, commit, "dataset")
         unfinished = STOPPED
-    except Offline:
-        unfinished = f"no such path{neighbour(name)}, and it cannot be downloaded ({{}})"
     with _errors_of_download(name, revision, argument, unfinished):
-        found = snapshot_download(name, repo_type="dataset", revision=revision, library_name="saccade")
+        found = snapshot_download(name, repo_type="dataset", revision=commit, library_name="saccade")
     folder = Path(found)
     missing = [file for file in hub_cache.read_listing(folder) or () if not (folder / file).is_file()]
     if missing:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 import math
 import numbers
-import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -116,7 +115,12 @@ def check_ramp_rate(name: str, value: object) -> float:
     Raises:
         InputError: It is not a finite number above 0.
     """
-    is_number = isinstance(value, numbers.Real) and not isinstance(value, bool)
-    if not is_number or not 0 < value <= sys.float_info.max:  # type: ignore[operator]
+    rate = math.nan
+    if isinstance(value, numbers.Real) and not isinstance(value, bool):
+        try:
+            rate = float(value)
+        except OverflowError:  # an integer that no float can hold
+            rate = math.inf
+    if not 0 < rate < math.inf:
         raise InputError(f"{name}: expected a finite number above 0, got {value!r:.100}")
-    return float(value)  # type: ignore[arg-type]
+    return rate

@@ -87,7 +87,7 @@ def _of_policy(policy: Policy) -> Configs:
     steps = {
         "video": range(1 - (needs.video_horizon or 1), 1) if seen is None else seen,
         "state": range(1 - needs.state_history, 1) if seen is None else seen,
-        "action": range(horizon) if acted is None else acted,
+        "action": range(horizon) if acted is None else acted[:horizon],
         "language": range(1) if seen is None else seen,
     }
     return {

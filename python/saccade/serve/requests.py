@@ -152,10 +152,14 @@ def _options(given: Any, num_timestep_buckets: int) -> Options:
             read[name] = integer(f"options: {name}", value, least=0)
     ignored = [str(key)[:LONGEST_SESSION] for key in given if key not in OPTIONS or key in unread]
     released = {name: found[name] for name in RELEASED if name in found and name not in unread}
+    chunking = _chunking(read, released)
+    if chunking is not None:
+        values = (chunking.horizon, chunking.overlap, chunking.frozen, chunking.ramp_rate)
+        released = dict(zip(RELEASED, values, strict=True))
     return Options(
         **read,
         session=session,
-        chunking=_chunking(read, released),
+        chunking=chunking,
         stated=read if session is None else {"session": session, **read, **released},
         ignored=tuple(ignored[:MOST_IGNORED]),
     )

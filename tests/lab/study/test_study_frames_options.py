@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 
 from saccade import Policy
+from saccade._internal.files import sha256_of
 from saccade.cli import main
 from saccade.observations.pictures import read_frames
-from saccade_lab.files import checkpoint_identity, overrides
+from saccade_lab.files import checkpoint_identity, data_config_text
 from saccade_lab.inside import head_inputs
 from saccade_lab.study.pictures import PictureSource, encode
 from saccade_lab.study.questions.gradients import reference_of
@@ -71,13 +72,13 @@ def test_commands_take_and_record_it(frames: Path, config: Path, tmp_path: Path)
     out = str(tmp_path / "study")
     assert main(["study", "gradients", *words, "--projections", "1", "--out", out]) == 0
     assert main(["study", "cuts", *words, "--arms", "future-unread", "--out", out]) == 0
-    recorded = overrides(str(config), None, None)
+    recorded = {"sha256": sha256_of(config)}
     settings = read_provenance(tmp_path / "study" / "cuts.json").settings["frames"]
-    assert recorded["data_config"] == settings["data_config"]
+    assert settings["data_config"] == recorded
     few = ["--blocks", "0", "--steps", "0", "--cell", "4", "--out", str(tmp_path / "maps")]
     assert main(["attention", *words, *few]) == 0
     found = json.loads((tmp_path / "maps" / "attention.json").read_text())
-    assert found["source"]["data_config"] == recorded["data_config"]
+    assert found["source"]["data_config"] == recorded
     assert [camera["name"] for camera in found["layout"]["cameras"]] == ["wrist", "front"]
 
 
@@ -90,6 +91,33 @@ def test_another_horizon_and_processor(frames: Path, tmp_path: Path) -> None:
     settings = read_provenance(tmp_path / "study" / "gradients.json").settings["frames"]
     assert settings["action_horizon"] == 20
     assert settings["processor_options"] == {"letter_box_transform": True}
+    given = {"checkpoint": str(whole("n17")), "frames": str(frames), "instruction": TOLD, "num_threads": 1}
+    plain = PictureSource(**given, embodiment=EMBODIMENT)
+    pad = PictureSource(
+        **given, embodiment=EMBODIMENT, action_horizon=20, processor_options='{"letter_box_transform": true}'
+    )
+    assert pad.config.action_horizon == pad.head().config.action_horizon == 20
+    assert plain.config.action_horizon != 20
+    assert pad.all.backbone_features.tobytes() != plain.all.backbone_features.tobytes()
+
+
+def test_another_tokenizer_is_recorded(frames: Path, tmp_path: Path) -> None:
+    other = tmp_path / "tokenizer.json"
+    shutil.copy(whole("n17") / "tokenizer.json", other)
+    given = {"checkpoint": str(whole("n17")), "frames": str(frames), "instruction": TOLD, "num_threads": 1}
+    source = PictureSource(**given, embodiment=EMBODIMENT, tokenizer=str(other))
+    assert source.describe()["frames"]["tokenizer"] == {"sha256": sha256_of(other)}
+    assert "tokenizer" not in PictureSource(**given, embodiment=EMBODIMENT).describe()["frames"]
+
+
+def test_a_data_config_beside_the_command_is_a_path(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Workers of a cluster have it elsewhere: what has no separator could not be told from a word."""
+    monkeypatch.chdir(tmp_path)
+    assert data_config_text("keys.json") == "./keys.json"
+    (tmp_path / "so100").mkdir()
+    source = PictureSource("policy", "frames", data_config=data_config_text("so100"))
+    assert source.data_config == "so100"
+    assert "so100" not in source.files
 
 
 @pytest.mark.parametrize("command", ["study cuts", "attention"])
@@ -104,5 +132,12 @@ def test_the_hash_of_a_checkpoint_covers_its_statistics(name: str, tmp_path: Pat
     before = checkpoint_identity(folder)
     (folder / name).write_text((folder / name).read_text() + "\n")
     after = checkpoint_identity(folder)
-    assert (before["name"], after["name"]) == ("n17", "n17")
-    assert before["sha256"] != after["sha256"]
+    assert (before["name"], before["sha256"]) == (after["name"], after["sha256"])
+    assert before["robot_sha256"] != after["robot_sha256"]
+
+
+@pytest.mark.parametrize("name", ["n15", "n17"])
+def test_committed_studies_are_of_the_committed_policies(name: str) -> None:
+    folder = Path(__file__).parents[3] / "studies" / "libero"
+    recorded = read_provenance(folder / f"cuts-{name}" / "cuts.json").settings["checkpoint"]
+    assert recorded["sha256"] == checkpoint_identity(folder / name)["sha256"]

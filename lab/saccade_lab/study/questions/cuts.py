@@ -33,7 +33,7 @@ arms:
 examples:
   saccade study cuts --episodes 15 --out out/study
   saccade study cuts --arms future-unread future-blind --tasks push --jobs 2 --out out/study
-  saccade study cuts --checkpoint GR00T-N1.5-3B/ --frames table/ --instruction "take the pear" --out out/own
+  saccade study cuts --checkpoint my-finetune/ --frames table/ --instruction "take the pear" --out out/own
   saccade study cuts --checkpoint checkpoint/ --features observations.npz --out out/study
 """
 

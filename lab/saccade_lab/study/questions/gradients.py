@@ -56,7 +56,7 @@ tokens that the backbone is given, and by the pixels of the views.
 examples:
   saccade study gradients --out out/study
   saccade study gradients --checkpoint out/policy --demos out/demos --tasks push --out out/study
-  saccade study gradients --checkpoint GR00T-N1.5-3B/ --frames table/ --projections 4 --out out/own
+  saccade study gradients --checkpoint my-finetune/ --frames table/ --projections 4 --out out/own
   saccade study gradients --checkpoint checkpoint/ --features observations.npz --out out/study
 """
 

@@ -57,7 +57,7 @@ numbers of vision-language tokens are.
 examples:
   saccade study patching --episodes 15 --out out/study
   saccade study patching --kinds layout --blocks 1 --steps 0 --tasks push --out out/study
-  saccade study patching --checkpoint GR00T-N1.5-3B/ --frames table/ --instruction "take the pear" \\
+  saccade study patching --checkpoint my-finetune/ --frames table/ --instruction "take the pear" \\
     --other-instruction "take the apple" --out out/own
   saccade study patching --checkpoint checkpoint/ --features observations.npz --out out/study
 """

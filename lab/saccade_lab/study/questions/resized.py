@@ -36,7 +36,7 @@ every token twice, with twice the mass, and with the same mass (which must chang
 examples:
   saccade study n-runtime --out out/study
   saccade study n-runtime --checkpoint out/policy --num-future-tokens 1 4 16 --episodes 20 --out out/study
-  saccade study n-runtime --checkpoint GR00T-N1.5-3B/ --frames table/ --out out/own
+  saccade study n-runtime --checkpoint my-finetune/ --frames table/ --out out/own
   saccade study n-runtime --checkpoint checkpoint/ --features observations.npz --out out/study
 """
 
