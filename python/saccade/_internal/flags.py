@@ -250,7 +250,7 @@ def add_processes(parser: argparse.ArgumentParser, items: str, heading: str = "s
     group = parser.add_argument_group(heading)
     group.add_argument(
         "--jobs",
-        type=int,
+        type=_number_of_jobs,
         metavar="N",
         help=f"{items} computed at the same time, in processes of their own; -1 for one per core; with 1 "
         "the command itself computes (default: 1; with ray -1)",
@@ -268,17 +268,25 @@ def add_processes(parser: argparse.ArgumentParser, items: str, heading: str = "s
     )
 
 
+def _number_of_jobs(word: str) -> int:
+    number = int(word)
+    if number < 1 and number != -1:
+        raise UsageError(f"--jobs: given {number}, expected at least 1, or -1 for one per core")
+    return number
+
+
+_number_of_jobs.__name__ = "int"  # for argparse's own message on a word that is no number
+
+
 def processes(args: argparse.Namespace) -> dict[str, Any]:
     """Backend, number of jobs and address, from the flags of `add_processes`.
 
     Raises:
-        UsageError: The number of jobs is out of range, or an address is given without Ray.
+        UsageError: An address is given without Ray.
     """
     jobs = args.jobs
     if jobs is None:
         jobs = -1 if args.backend == "ray" else 1
-    if jobs < 1 and jobs != -1:
-        raise UsageError(f"--jobs: given {jobs}, expected at least 1, or -1 for one per core")
     if args.address is not None and args.backend != "ray":
         raise UsageError(f"--address: only with --backend ray, given {args.backend}")
     return {"backend": args.backend, "jobs": jobs, "address": args.address}
