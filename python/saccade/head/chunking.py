@@ -116,9 +116,10 @@ def check_ramp_rate(name: str, value: object) -> float:
         InputError: It is not a finite number above 0.
     """
     rate = math.nan
-    if isinstance(value, numbers.Real) and not isinstance(value, bool):
+    is_number = isinstance(value, numbers.Real) and not isinstance(value, bool)
+    if is_number:
         try:
-            rate = float(value)
+            rate = float(value)  # type: ignore[arg-type]
         except OverflowError:  # an integer that no float can hold
             rate = math.inf
     if not 0 < rate < math.inf:

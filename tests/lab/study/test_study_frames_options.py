@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -38,6 +39,13 @@ CONFIG = {
 @pytest.fixture(scope="module")
 def frames(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_pictures_of(tmp_path_factory.mktemp("frames") / "table", "pour/1", "wipe/1")
+
+
+def source_of(frames: Path, **options: Any) -> PictureSource:
+    """Pictures for a checkpoint of N1.7."""
+    return PictureSource(
+        str(whole("n17")), str(frames), TOLD, embodiment=EMBODIMENT, num_threads=1, **options
+    )
 
 
 @pytest.fixture
@@ -91,11 +99,8 @@ def test_another_horizon_and_processor(frames: Path, tmp_path: Path) -> None:
     settings = read_provenance(tmp_path / "study" / "gradients.json").settings["frames"]
     assert settings["action_horizon"] == 20
     assert settings["processor_options"] == {"letter_box_transform": True}
-    given = {"checkpoint": str(whole("n17")), "frames": str(frames), "instruction": TOLD, "num_threads": 1}
-    plain = PictureSource(**given, embodiment=EMBODIMENT)
-    pad = PictureSource(
-        **given, embodiment=EMBODIMENT, action_horizon=20, processor_options='{"letter_box_transform": true}'
-    )
+    plain = source_of(frames)
+    pad = source_of(frames, action_horizon=20, processor_options='{"letter_box_transform": true}')
     assert pad.config.action_horizon == pad.head().config.action_horizon == 20
     assert plain.config.action_horizon != 20
     assert pad.all.backbone_features.tobytes() != plain.all.backbone_features.tobytes()
@@ -104,10 +109,9 @@ def test_another_horizon_and_processor(frames: Path, tmp_path: Path) -> None:
 def test_another_tokenizer_is_recorded(frames: Path, tmp_path: Path) -> None:
     other = tmp_path / "tokenizer.json"
     shutil.copy(whole("n17") / "tokenizer.json", other)
-    given = {"checkpoint": str(whole("n17")), "frames": str(frames), "instruction": TOLD, "num_threads": 1}
-    source = PictureSource(**given, embodiment=EMBODIMENT, tokenizer=str(other))
+    source = source_of(frames, tokenizer=str(other))
     assert source.describe()["frames"]["tokenizer"] == {"sha256": sha256_of(other)}
-    assert "tokenizer" not in PictureSource(**given, embodiment=EMBODIMENT).describe()["frames"]
+    assert "tokenizer" not in source_of(frames).describe()["frames"]
 
 
 def test_a_data_config_beside_the_command_is_a_path(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
