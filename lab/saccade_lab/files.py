@@ -9,9 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from saccade._internal.files import sha256_of
-from saccade._internal.hub_files import TOKENIZER
-from saccade._internal.tokenizers import tokenizer_path
-from saccade.evaluation.source import contents_hash
+from saccade._internal.hub_files import STATISTICS
+from saccade.evaluation.source import contents_hash, option_files
 from saccade.robots.data_configs import RELEASED
 
 #: Files whose hash is that of a checkpoint, besides the tensors.
@@ -19,10 +18,12 @@ COMPANIONS = (
     *("config.json", "tokenizer.json"),
     *("experiment_cfg/metadata.json", "experiment_cfg/data_config.json"),
 )
+#: The statistics that N1.5 has.
+OF_N15 = ("config.json", "metadata.json", "experiment_cfg/*.json")
 #: Files of N1.6, N1.7 and lerobot that say how observations and actions are converted.
 CONVERSIONS = (
-    *("processor_config.json", "statistics.json", "dataset_statistics.json", "embodiment_id.json"),
-    *("processor/*.json", "policy_*processor*.json", "preprocessor_config.json"),
+    *(name for name in STATISTICS if name.endswith(".json") and name not in OF_N15),
+    *("preprocessor_config.json", "processor/*.json"),
 )
 
 
@@ -75,33 +76,26 @@ def data_config_text(given: str | None) -> str | None:
     return given if given is None or given in RELEASED else path_text(Path(given))
 
 
-def loading_identity(
-    checkpoint: Path,
-    tokenizer: str | Path | None,
-    data_config: str | None,
-    action_horizon: int | None,
-    processor_options: Mapping[str, Any] | None,
-) -> dict[str, Any]:
-    """What a record says of these options of ``saccade.Policy.from_pretrained``: those that decide something.
+def loading_identity(checkpoint: Path, options: Mapping[str, Any]) -> dict[str, Any]:
+    """What a record says of how a policy was loaded: which tokenizer, data config, horizon and processor.
 
-    Files are hashes. The tokenizer is the one that is read in place of the checkpoint's own.
+    Only what the checkpoint does not say is there. Files are hashes.
+
+    Args:
+        checkpoint: Path of the checkpoint.
+        options: Of ``saccade.Policy.from_pretrained``.
 
     Example:
         >>> from saccade import demo_checkpoint
-        >>> loading_identity(demo_checkpoint(), None, "so100", None, None)
+        >>> loading_identity(demo_checkpoint(), {"data_config": "so100", "action_horizon": None})
         {'data_config': 'so100'}
     """
-    found: dict[str, Any] = {}
-    path = tokenizer_path(checkpoint, tokenizer)
-    if path is not None:
-        found["tokenizer"] = {"sha256": contents_hash(path, TOKENIZER)}
-    if data_config is not None:
-        is_name = data_config in RELEASED
-        found["data_config"] = data_config if is_name else {"sha256": sha256_of(Path(data_config))}
-    if action_horizon is not None:
-        found["action_horizon"] = action_horizon
-    if processor_options is not None:
-        found["processor_options"] = dict(processor_options)
+    found: dict[str, Any] = {
+        name: {"sha256": digest} for name, digest in option_files(checkpoint, options).items()
+    }
+    for name in ("data_config", "action_horizon", "processor_options"):
+        if options.get(name) is not None:
+            found.setdefault(name, options[name])
     return found
 
 

@@ -74,6 +74,21 @@ def head_config(layout: str) -> Config:
     return config
 
 
+def data_config(*cameras: str) -> Config:
+    """A data config of three actions for the robot of `isaac`, which looks through these cameras."""
+    return {
+        "video_keys": [f"video.{name}" for name in cameras],
+        "state_keys": ["state.hand", "state.arm"],
+        "action_keys": ["action.arm", "action.hand"],
+        "language_keys": ["annotation.human.task_description"],
+        "observation_indices": [0],
+        "action_indices": [0, 1, 2],
+        "state_modes": {"state.arm": "q99", "state.hand": "min_max"},
+        "action_modes": {"action.arm": "min_max", "action.hand": "min_max"},
+        "target_rotations": {},
+    }
+
+
 def write(folder: Path, layout: str, *, seed: int = 0, tokenizer: bool = True) -> Path:
     """Writes a whole checkpoint.
 

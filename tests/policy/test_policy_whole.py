@@ -19,7 +19,7 @@ import saccade
 from saccade import CheckpointError, InputError, Policy, PolicyContext
 from tests.helpers import layouts, whole_checkpoints
 from tests.helpers.policy_cases import inputs_of, noise
-from tests.helpers.whole_checkpoints import EMBODIMENT, whole
+from tests.helpers.whole_checkpoints import EMBODIMENT, data_config, whole
 
 Observation = dict[str, Any]
 
@@ -157,17 +157,7 @@ def test_the_data_config_of_a_fine_tune_may_differ_from_its_metadata() -> None:
     swapped = Policy.from_pretrained(whole("isaac"), cameras=["front", "wrist"])
     observation = told(default, "push")
     assert not same(swapped.act(observation, seed=0), default.act(observation, seed=0))
-    config = {
-        "video_keys": ["video.front"],
-        "state_keys": ["state.hand", "state.arm"],
-        "action_keys": ["action.arm", "action.hand"],
-        "language_keys": ["annotation.human.task_description"],
-        "observation_indices": [0],
-        "action_indices": [0, 1, 2],
-        "state_modes": {"state.arm": "q99", "state.hand": "min_max"},
-        "action_modes": {"action.arm": "min_max", "action.hand": "min_max"},
-        "target_rotations": {},
-    }
+    config = data_config("front")
     policy = Policy.from_pretrained(whole("isaac"), data_config=config)
     assert policy.requirements.state == (("hand", 2), ("arm", 5))
     assert [camera.name for camera in policy.requirements.cameras] == ["front"]

@@ -262,11 +262,12 @@ def take_frames(args: argparse.Namespace, checkpoint: Path) -> tuple[ActionHead,
     from saccade_lab.inside import parts_of
     from saccade_lab.maps.view import from_policy
 
+    options = arguments.loading_options(args)
     with output.progress_bar("loading", transient=True):
         policy = Policy.from_pretrained(
             checkpoint,
             precision={"backbone": args.precision or "float32", "head": "float32"},
-            **arguments.loading_options(args),
+            **options,
         )
     parts = parts_of(policy)
     recorded = read_frames(args.frames, policy, instruction=args.instruction, state=args.state)
@@ -287,9 +288,7 @@ def take_frames(args: argparse.Namespace, checkpoint: Path) -> tuple[ActionHead,
             "embodiment_id": policy.embodiment_id,
             "precision": args.precision or "float32",
             "preprocessing": parts.processor.preprocessing,
-            **loading_identity(
-                checkpoint, args.tokenizer, args.data_config, args.action_horizon, args.processor_options
-            ),
+            **loading_identity(checkpoint, options),
             "noise": f"seed {args.seed}",
         },
     )

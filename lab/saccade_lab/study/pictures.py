@@ -12,6 +12,7 @@ from typing import Any, ClassVar, Literal
 
 import numpy as np
 
+from saccade._internal.arrays import LOADING_OPTIONS
 from saccade.backbone.config import BackboneConfig
 from saccade.backbone.inputs import BackboneInputs
 from saccade.errors import InputError
@@ -80,8 +81,12 @@ class PictureSource(Recorded):
         return (*super().files, *(path for path in read if path is not None and Path(path).exists()))
 
     @property
-    def _processor_options(self) -> dict[str, Any] | None:
-        return None if self.processor_options is None else json.loads(self.processor_options)
+    def options(self) -> dict[str, Any]:
+        """How the policy is loaded, besides precision and threads: arguments of ``from_pretrained``."""
+        found = {name: getattr(self, name) for name in LOADING_OPTIONS}
+        if self.processor_options is not None:
+            found["processor_options"] = json.loads(self.processor_options)
+        return found
 
     def describe(self) -> dict[str, Any]:
         """See ``Source``."""
@@ -95,13 +100,7 @@ class PictureSource(Recorded):
                 "noise": f"{NOISES} draws an observation",
                 "precision": self.precision,
                 "preprocessing": encoded.preprocessing,
-                **loading_identity(
-                    Path(self.checkpoint),
-                    self.tokenizer,
-                    self.data_config,
-                    self.action_horizon,
-                    self._processor_options,
-                ),
+                **loading_identity(Path(self.checkpoint), self.options),
                 "embodiment_id": int(encoded.observation.embodiment_id[0]),
                 "action_width": encoded.action_width,
                 "other": other,
@@ -178,12 +177,7 @@ def encode(source: PictureSource) -> Encoded:
     """Loads the policy and encodes all observations; cached for the next cell."""
     policy = Policy.from_pretrained(
         source.checkpoint,
-        embodiment=source.embodiment,
-        preprocessing=source.preprocessing,
-        tokenizer=source.tokenizer,
-        data_config=source.data_config,
-        action_horizon=source.action_horizon,
-        processor_options=source._processor_options,
+        **source.options,
         precision={"backbone": source.precision, "head": "float32"},
         num_threads=source.num_threads,
     )

@@ -8,6 +8,7 @@ text or index is something else or out of range.
 from __future__ import annotations
 
 import math
+import numbers
 import operator
 import sys
 from collections.abc import Collection, Mapping, Sequence, Set
@@ -272,6 +273,16 @@ def integer(name: str, value: int, least: int = 1) -> int:
     if number >= 2**63:
         raise InputError(f"{name}: expected a number below 2**63, got {number}")
     return number
+
+
+def real(value: object) -> float:
+    """A number, of Python or NumPy, as a float: infinity if none can hold it, NaN for what is no number."""
+    if isinstance(value, bool) or not isinstance(value, numbers.Real):
+        return math.nan
+    try:
+        return float(value)
+    except OverflowError:
+        return math.inf
 
 
 def indices(name: str, value: Any) -> tuple[int, ...] | None:

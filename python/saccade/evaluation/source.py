@@ -101,18 +101,8 @@ class Source:
         }
 
     def option_files(self) -> dict[str, str]:
-        """SHA-256 of the files that are read besides the checkpoint, by the option that names them.
-
-        The published tokenizer of a checkpoint without one is among them.
-        """
-        found = {}
-        tokenizer = tokenizer_path(self.checkpoint, self.options.get("tokenizer"))
-        if tokenizer is not None:
-            found["tokenizer"] = contents_hash(tokenizer, TOKENIZER)
-        data_config = self.options.get("data_config")
-        if isinstance(data_config, str) and data_config not in RELEASED:
-            found["data_config"] = contents_hash(Path(data_config), ())
-        return found
+        """As :func:`option_files`."""
+        return option_files(self.checkpoint, self.options)
 
     def names(self) -> dict[str, str]:
         """What readers call checkpoint and recordings: their ids, or the names of their folders."""
@@ -181,6 +171,25 @@ def _data(recordings: str) -> Dataset:
 def forget_policy() -> None:
     """Drops the policy that this process has loaded, so that another one finds its memory free."""
     _loaded.clear()
+
+
+def option_files(checkpoint: str | Path, options: Mapping[str, Any]) -> dict[str, str]:
+    """SHA-256 of the files that are read besides a checkpoint, by the option that names them.
+
+    The published tokenizer of a checkpoint without one is among them.
+
+    Args:
+        checkpoint: Path of the checkpoint.
+        options: Of :meth:`saccade.Policy.from_pretrained`.
+    """
+    found = {}
+    tokenizer = tokenizer_path(checkpoint, options.get("tokenizer"))
+    if tokenizer is not None:
+        found["tokenizer"] = contents_hash(tokenizer, TOKENIZER)
+    data_config = options.get("data_config")
+    if isinstance(data_config, str) and data_config not in RELEASED:
+        found["data_config"] = contents_hash(Path(data_config), ())
+    return found
 
 
 def weights_hash(checkpoint: str | Path) -> str:

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import itertools
 import math
-import numbers
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from saccade._internal.arrays import integer
+from saccade._internal.arrays import integer, real
 from saccade.errors import InputError
 
 #: The options of real-time chunking in the released head of N1.7, which needs all of them.
@@ -115,13 +114,7 @@ def check_ramp_rate(name: str, value: object) -> float:
     Raises:
         InputError: It is not a finite number above 0.
     """
-    rate = math.nan
-    is_number = isinstance(value, numbers.Real) and not isinstance(value, bool)
-    if is_number:
-        try:
-            rate = float(value)  # type: ignore[arg-type]
-        except OverflowError:  # an integer that no float can hold
-            rate = math.inf
+    rate = real(value)
     if not 0 < rate < math.inf:
         raise InputError(f"{name}: expected a finite number above 0, got {value!r:.100}")
     return rate

@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
-import math
-import numbers
 from collections.abc import Mapping, Sequence
 from typing import Any, TypedDict
 
 import numpy as np
 
-from saccade._internal.arrays import LARGEST, ArrayLike, Float32Array, apart, does_not_fit, float32, integer
+from saccade._internal.arrays import (
+    LARGEST,
+    ArrayLike,
+    Float32Array,
+    apart,
+    does_not_fit,
+    float32,
+    integer,
+    real,
+)
 from saccade.errors import InputError
 from saccade.head.chunking import Chunking
 from saccade.head.intervention import Intervention, as_interventions
@@ -51,11 +58,7 @@ def check_guidance(guidance: object, name: str = "guidance") -> float | None:
     """
     if guidance is None:
         return None
-    is_number = isinstance(guidance, numbers.Real) and not isinstance(guidance, bool)
-    try:
-        weight = float(guidance) if is_number else math.nan  # type: ignore[arg-type]
-    except OverflowError:
-        weight = math.inf
+    weight = real(guidance)
     if not 0 <= weight <= LARGEST:
         raise InputError(f"{name}: expected a finite number of at least 0, got {guidance!r:.100}")
     return None if weight == 1 else weight

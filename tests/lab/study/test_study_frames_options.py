@@ -20,20 +20,10 @@ from saccade_lab.study.pictures import PictureSource, encode
 from saccade_lab.study.questions.gradients import reference_of
 from saccade_lab.study.table import read_provenance
 from tests.helpers.frames_cases import write_pictures_of
-from tests.helpers.whole_checkpoints import EMBODIMENT, whole
+from tests.helpers.whole_checkpoints import EMBODIMENT, data_config, whole
 
 TOLD = "open the drawer"
-CONFIG = {
-    "video_keys": ["video.wrist", "video.front"],
-    "state_keys": ["state.hand", "state.arm"],
-    "action_keys": ["action.arm", "action.hand"],
-    "language_keys": ["annotation.human.task_description"],
-    "observation_indices": [0],
-    "action_indices": [0, 1, 2],
-    "state_modes": {"state.arm": "q99", "state.hand": "min_max"},
-    "action_modes": {"action.arm": "min_max", "action.hand": "min_max"},
-    "target_rotations": {},
-}
+CONFIG = data_config("wrist", "front")
 
 
 @pytest.fixture(scope="module")
