@@ -24,6 +24,7 @@
 mod alloc;
 mod array;
 mod backbone;
+mod cache;
 mod config;
 mod engine;
 mod error;

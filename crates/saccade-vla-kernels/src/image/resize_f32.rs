@@ -3,7 +3,7 @@
 //! Equation 44 of docs/equations.md.
 
 use super::taps::Taps;
-use super::{Image, Sums, along_height, along_width, blank, reserved, sum_rows};
+use super::{Image, Sums, along_height, along_width, area, blank, reserved, sum_rows};
 use crate::aligned::AllocError;
 use crate::isa::Isa;
 
@@ -36,7 +36,7 @@ impl FloatImage {
 /// `interpolate(..., mode="bilinear", antialias=True)` of float32.
 ///
 /// The taps of an output are summed as torch's compiled loop does: of those after the first, four at a time with a rounded product, the last
-/// ones fused.
+/// ones fused. An axis that keeps its length would have each value times one, plus its neighbour times zero, so it is left as it is.
 ///
 /// ```
 /// use saccade_vla_kernels::{Image, Isa, resize_linear_f32};
@@ -58,13 +58,28 @@ pub fn resize_linear_f32(
     width: usize,
 ) -> Result<FloatImage, AllocError> {
     assert!(height > 0 && width > 0);
-    let narrow = along_width(isa, &Linear::new(image.width, width)?, image)?;
-    let pixels = along_height(isa, &Linear::new(image.height, height)?, &narrow, width)?;
+    let narrow = match image.width == width {
+        true => values(image)?,
+        false => along_width(isa, &Linear::new(image.width, width)?, image)?,
+    };
+    let pixels = match image.height == height {
+        true => narrow,
+        false => along_height(isa, &Linear::new(image.height, height)?, &narrow, width)?,
+    };
     Ok(FloatImage {
         pixels,
         height,
         width,
     })
+}
+
+/// `image / 255`.
+fn values(image: Image<'_>) -> Result<Vec<f32>, AllocError> {
+    let mut values = reserved(area(image.height, image.width)?)?;
+    for row in 0..image.height {
+        values.extend(image.row(row).iter().map(|&byte| Linear::value(byte)));
+    }
+    Ok(values)
 }
 
 /// The sums of one axis.
@@ -121,5 +136,30 @@ impl Sums for Linear {
         // The first tap, and as many fours of the others as there are.
         let rounded = 1 + (weights.len() - 1) / 4 * 4;
         sum_rows(&inputs[first * inner..], weights, rounded, inner, out);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_axis_that_keeps_its_length_has_the_bits_of_its_sums() {
+        let all: Vec<u8> = (0..7 * 9 * 3).map(|index| (index * 89 % 256) as u8).collect();
+        let image = Image::new(&all, 7, 9).crop(1, 2, 5, 6);
+        for isa in Isa::available() {
+            for (height, width) in [(5, 6), (5, 4), (3, 6)] {
+                let narrow = along_width(isa, &Linear::new(6, width).unwrap(), image).unwrap();
+                let expected = along_height(isa, &Linear::new(5, height).unwrap(), &narrow, width).unwrap();
+                let found = resize_linear_f32(isa, image, height, width).unwrap();
+                assert!(
+                    found
+                        .pixels
+                        .iter()
+                        .map(|value| value.to_bits())
+                        .eq(expected.iter().map(|value| value.to_bits()))
+                );
+            }
+        }
     }
 }

@@ -9,11 +9,11 @@ use faer::linalg::matmul::matmul;
 use faer::{Accum, Mat, MatRef, Par};
 use saccade_vla_kernels::{Epilogue, LinearScratch, Matrix, Rows, RowsMut, WeightRef, silu};
 
-use super::cache::Cache;
 use super::embodiment_layers::EmbodimentLinear;
 use super::embodiments::Embodiments;
 use crate::alloc::Scratch;
 use crate::array::OwnedArray;
+use crate::cache::Cache;
 use crate::config::HeadConfig;
 use crate::engine::{Engine, Kernels};
 use crate::error::Result;

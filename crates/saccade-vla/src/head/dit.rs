@@ -7,9 +7,9 @@ use std::sync::Arc;
 
 use saccade_vla_kernels::{Epilogue, LinearScratch, PackedKeyValues, Rows, RowsMut};
 
-use super::cache::Cache;
 use super::context::Context;
 use crate::alloc::Scratch;
+use crate::cache::Cache;
 use crate::config::{HeadConfig, Reads};
 use crate::engine::{Engine, Kernels};
 use crate::error::{Error, Result};

@@ -2,7 +2,6 @@
 
 mod action_encoder;
 pub(crate) mod action_head;
-mod cache;
 mod check;
 mod checkpoint;
 pub(crate) mod context;

@@ -17,6 +17,7 @@ use tokenizers::{
     AddedToken, Decoder, DecoderWrapper, PostProcessorWrapper, SplitDelimiterBehavior, TokenizerImpl,
 };
 
+use crate::cache::Cache;
 use crate::error::{Error, Problem, Result, bail, problem};
 use find::FilesText;
 use parts::{PATTERN, Parts};
@@ -25,6 +26,12 @@ pub use find::TokenizerFiles;
 
 /// Longer text is refused before it is looked at: no model takes as many tokens, and the pattern gives up on a million spaces.
 const MAX_TEXT_BYTES: usize = 1 << 18;
+
+/// Texts whose ids are kept: a farm has several tasks, and guidance two prompts for each.
+const RECENT_TEXTS: usize = 16;
+
+/// Bytes of the longest of them.
+const LONGEST_RECENT: usize = 1 << 14;
 
 /// That text which errors call `name` is not too long to be split.
 ///
@@ -42,6 +49,8 @@ type Inner = TokenizerImpl<BPE, NFC, Sequence, PostProcessorWrapper, DecoderWrap
 /// Text to token ids.
 pub struct Tokenizer {
     inner: Inner,
+    /// Ids of the texts that were asked for last: a control loop asks for the same prompt in every step.
+    recent: Cache<String, Vec<u32>>,
     /// Number of tokens.
     len: usize,
 }
@@ -121,7 +130,8 @@ impl Tokenizer {
             })
             .collect();
         inner.add_tokens(&added);
-        Ok(Self { inner, len })
+        let recent = Cache::new(RECENT_TEXTS);
+        Ok(Self { inner, recent, len })
     }
 
     /// The ids of `text`. Nothing is added at either end, and a special token's own string becomes that token.
@@ -138,9 +148,15 @@ impl Tokenizer {
     /// # Errors
     /// [`Error::Input`] for text that the crate refuses.
     pub(super) fn ids(&self, name: &str, text: &str) -> Result<Vec<u32>> {
-        let encoding = self.inner.encode_fast(text, false);
-        let encoding = encoding.map_err(|problem| Error::Input(Problem::new(name, problem)))?;
-        Ok(encoding.get_ids().to_vec())
+        let ids = || {
+            let encoding = self.inner.encode_fast(text, false);
+            let encoding = encoding.map_err(|problem| Error::Input(Problem::new(name, problem)))?;
+            Ok(encoding.get_ids().to_vec())
+        };
+        if text.len() > LONGEST_RECENT {
+            return ids();
+        }
+        Ok(self.recent.get_or_insert(text.to_owned(), ids)?.to_vec())
     }
 
     /// The text of a token; none for an id that is no token's. Bytes that are no whole characters become U+FFFD.
