@@ -23,6 +23,7 @@ RECORDS = kept.RECORDS / "policy"
 """A folder for each release, with a JSON file per CPU family."""
 
 LEROBOT_BF16 = ("policy-lerobot-bfloat16-pure", "policy-lerobot-bfloat16")
+LEROBOT_F32 = "policy-lerobot-float32"
 OVERVIEW = (
     "policy-lerobot-default",
     "policy-lerobot-bfloat16-pure",
@@ -212,15 +213,46 @@ def section(results: Results, case: Case) -> list[str]:
     said = [f"- {label} could not run: {reason}" for label, reason in failed.items()]
     notes = {CONTENDERS[name].label: results.notes(case, name) for name in names}
     said += [f"- {label}: {note}." for label, note in notes.items() if note]
-    return [f"## {plural(case.threads).capitalize()}", table([*head, "error"], rows), "\n".join(said)]
+    threads = plural(case.threads).capitalize()
+    return [f"## {threads}", table([*head, "error"], rows), faster_in_float32(results, case), "\n".join(said)]
+
+
+def faster_in_float32(results: Results, case: Case) -> str:
+    """How saccade compares with lerobot's float32 where that is faster than its bfloat16."""
+    medians = {
+        work: quartiles(results.seconds(case, LEROBOT_F32, work))[1]
+        for work in case.works
+        if LEROBOT_F32 in results.names(case) and results.is_correct(case, LEROBOT_F32)
+    }
+    peers = {work: fastest_bfloat16(results, case, work) for work in medians}
+    if not medians or not all(
+        peer and medians[work] < quartiles(results.seconds(case, peer, work))[1]
+        for work, peer in peers.items()
+    ):
+        return ""
+    said = []
+    for name in ("policy-saccade-float32", "policy-saccade-bfloat16", "policy-saccade-int8"):
+        if name in results.names(case) and results.is_correct(case, name):
+            compared = [results.ratio(case, LEROBOT_F32, name, work) for work in case.works]
+            ratios = " and ".join(f"{ratio[1]:.2f}" for ratio in compared if ratio is not None)
+            said.append(f"{CONTENDERS[name].label} is {ratios} x as fast")
+    return (
+        "lerobot is faster in float32 than in bfloat16 on this machine. Against that, "
+        f"{', '.join(said)} ({' and '.join(case.works)})."
+    )
+
+
+def fastest_bfloat16(results: Results, case: Case, work: str) -> str | None:
+    """lerobot's fastest correct bfloat16 setting without torch.compile, or None."""
+    peers = [peer for peer in LEROBOT_BF16 if peer in results.names(case) and results.is_correct(case, peer)]
+    return min(peers, key=lambda each: quartiles(results.seconds(case, each, work))[1], default=None)
 
 
 def speed_up(results: Results, case: Case, name: str, work: str) -> str:
     """How many times as fast as lerobot's fastest correct bfloat16."""
-    peers = [peer for peer in LEROBOT_BF16 if peer in results.names(case) and results.is_correct(case, peer)]
-    if not peers:
+    peer = fastest_bfloat16(results, case, work)
+    if peer is None:
         return ""
-    peer = min(peers, key=lambda each: quartiles(results.seconds(case, each, work))[1])
     compared = results.ratio(case, peer, name, work)
     assert compared is not None
     return f"{in_turn(results, case, peer, name, work)}{compared[1]:.2f} x"

@@ -167,6 +167,24 @@ def test_a_wrong_result_is_not_compared_with(tmp_path: Path) -> None:
     assert "2.5e-01, **not correct**" in "\n".join(policy_report.section(results, CASE))
 
 
+@pytest.mark.parametrize(("seconds", "said"), [(1.8, True), (3.0, False)])
+def test_it_is_said_where_lerobot_is_faster_in_float32(seconds: float, said: bool, tmp_path: Path) -> None:
+    results = measured(tmp_path / "policy.json")
+    results.open(CASE)["contenders"]["policy-lerobot-float32"] = {
+        "error": 1e-6,
+        "scale": 4.0,
+        "notes": "",
+        "seconds": {"1 view": [seconds] * 2, "2 views": [2 * seconds] * 2},
+    }
+    sentence = policy_report.faster_in_float32(results, CASE)
+    assert bool(sentence) == said
+    if said:
+        assert (
+            "saccade bfloat16 is 1.35 and 1.35 x as fast, saccade int8 is 2.70 and 2.70 x as fast" in sentence
+        )
+        assert sentence in policy_report.page([results])
+
+
 def test_the_page_contains_what_was_measured() -> None:
     measured = policy_report.recorded()
     assert measured

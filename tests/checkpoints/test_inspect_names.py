@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from pathlib import Path
 
@@ -16,6 +17,26 @@ from tests.helpers.lfs_pointer import POINTER
 
 def names_of(folder: Path) -> list[list[str]]:
     return [entry.names for entry in inspect(folder).embodiments]
+
+
+@pytest.mark.parametrize("given", [None, {}, {"new_embodiment": 3}])
+@pytest.mark.parametrize("layout", ["lerobot", "lerobot-n17"])
+def test_names_of_a_pipeline_are_those_that_its_policy_has(
+    layout: str, given: dict[str, int] | None, tmp_path: Path
+) -> None:
+    source = layouts.write(tmp_path / "it", layout)
+    path = source / "policy_preprocessor.json"
+    values = json.loads(path.read_text())
+    (pack,) = (step["config"] for step in values["steps"] if "embodiment_mapping" in step["config"])
+    pack["embodiment_mapping"] = given
+    names = {}
+    for tag in ("new_embodiment", "gr1", "oxe_droid", "never_heard_of"):
+        pack["embodiment_tag"] = tag
+        path.write_text(json.dumps(values))
+        names[tag] = saccade.Normalizer.from_pretrained(source).embodiment_id
+    shown = {name: place for place, listed in enumerate(names_of(source)) for name in listed}
+    # lerobot takes 0 for a tag that it does not know.
+    assert names == {tag: shown.get(tag, 0) for tag in names}
 
 
 def moved(folder: Path) -> Path:
@@ -61,7 +82,7 @@ def test_damaged_ids_are_not_replaced_by_the_released_ones(folder: str, text: st
         "[]",
         "{",
         POINTER,
-        '{"steps": [{"registry_name": "groot_", "config": {"embodiment_mapping": {"a": "b"}}}]}',
+        '{"steps": [{"registry_name": "groot_pack_inputs_v3", "config": {"embodiment_mapping": {"a": "b"}}}]}',
     ],
 )
 def test_nor_are_those_of_a_damaged_pipeline(text: str, tmp_path: Path) -> None:

@@ -143,6 +143,7 @@ def _embodiment_names(description: Description) -> dict[int, list[str]]:
     first = description.files[0].path if description.files else path
     folder = path if path.is_dir() else Path(first).parent
     names: dict[int, list[str]] = {}
-    for name, index in (embodiment_ids(folder) or IDS[description.version]).items():
+    found = embodiment_ids(folder)
+    for name, index in (IDS[description.version] if found is None else found).items():
         names.setdefault(index, []).append(name)
     return names

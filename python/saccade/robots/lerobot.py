@@ -26,7 +26,15 @@ from saccade.robots.isaac_processor import (
     modality,
     refuse_unknown_fields,
 )
-from saccade.robots.lerobot_pipeline import DECODE, PREPROCESSOR, Pipeline, action_steps, read_pipeline
+from saccade.robots.lerobot_pipeline import (
+    DECODE,
+    PACK_N15,
+    PACK_N17,
+    PREPROCESSOR,
+    Pipeline,
+    action_steps,
+    read_pipeline,
+)
 from saccade.robots.libero import TAG as LIBERO_TAG
 from saccade.robots.robot import Robot, finished
 from saccade.robots.rotations import POSES
@@ -45,10 +53,9 @@ def lerobot_robot(folder: Path, preprocessor: Mapping[str, Any], options: Option
     options.refuse_data_config(pipeline.where)
     taking, giving = pipeline.pack.config, pipeline.unpack.config
     tag = str(taking.get("embodiment_tag", "new_embodiment"))
-    given = taking.get("embodiment_mapping")
-    released = N17_IDS if pipeline.is_n17 else LEROBOT_N15_IDS
-    ids = released if given is None else checked_ids(pipeline.where, given)
-    embodiment_id = ids.get(tag, 0)  # as lerobot does with an unknown tag
+    embodiment_id = _ids(pipeline.where, pipeline.pack.name, taking).get(
+        tag, 0
+    )  # as lerobot does with an unknown tag
     options.check_only(tag, embodiment_id, "n1.7" if pipeline.is_n17 else "n1.5", pipeline.where)
     builder = Builder(pipeline.where, np.float32)
     for step in (pipeline.pack, pipeline.unpack):
@@ -88,8 +95,8 @@ def lerobot_robot(folder: Path, preprocessor: Mapping[str, Any], options: Option
     )
 
 
-def pipeline_ids(folder: Path) -> dict[str, int]:
-    """Ids by tag that a step of a checkpoint's preprocessor says; empty if none does.
+def pipeline_ids(folder: Path) -> Mapping[str, int] | None:
+    """Ids by tag of a directory that lerobot saved; None without a step of its preprocessor that takes them.
 
     Raises:
         CheckpointError: The file is damaged.
@@ -97,10 +104,18 @@ def pipeline_ids(folder: Path) -> dict[str, int]:
     path = folder / PREPROCESSOR
     steps = read_json(path).get("steps") if path.is_file() else None
     for step in steps if isinstance(steps, list) else ():
-        given = value_at(step, "config", "embodiment_mapping")
-        if given is not None:
-            return checked_ids(str(path), given)
-    return {}
+        name, config = value_at(step, "registry_name"), value_at(step, "config")
+        if name in (PACK_N15, PACK_N17):
+            return _ids(str(path), name, config if isinstance(config, Mapping) else {})
+    return None
+
+
+def _ids(where: str, name: str, config: Mapping[str, Any]) -> Mapping[str, int]:
+    """Ids by tag of the step of this name: its own, or lerobot's where it has none."""
+    given = config.get("embodiment_mapping")
+    if given is not None:
+        return checked_ids(where, given)
+    return N17_IDS if name == PACK_N17 else LEROBOT_N15_IDS
 
 
 def _state_groups(builder: Builder, pipeline: Pipeline) -> tuple[Group, ...]:

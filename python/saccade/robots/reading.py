@@ -71,13 +71,14 @@ def processor_version(folder: Path, values: Mapping[str, Any]) -> str | None:
     return MODEL_TYPES.get(str(read_json(folder / "config.json").get("model_type")))
 
 
-def embodiment_ids(folder: Path) -> dict[str, int]:
-    """Ids by tag in the files of a checkpoint from which :func:`read` takes them; empty without such a file.
+def embodiment_ids(folder: Path) -> Mapping[str, int] | None:
+    """Ids by tag as :func:`read` takes them from the files of a checkpoint; None without such a file.
 
     Raises:
         CheckpointError: A file is damaged.
     """
-    return pipeline_ids(folder) or _processor_ids(folder)
+    found = pipeline_ids(folder)
+    return found if found is not None else _processor_ids(folder) or None
 
 
 def _from_path(path: Path, options: Options) -> Robot:
