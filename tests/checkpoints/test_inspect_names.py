@@ -82,7 +82,7 @@ def test_damaged_ids_are_not_replaced_by_the_released_ones(folder: str, text: st
         "[]",
         "{",
         POINTER,
-        '{"steps": [{"registry_name": "groot_pack_inputs_v3", "config": {"embodiment_mapping": {"a": "b"}}}]}',
+        '{"steps": [{"registry_name": "groot_pack_inputs_v3", "config": {"embodiment_mapping": [1]}}]}',
     ],
 )
 def test_nor_are_those_of_a_damaged_pipeline(text: str, tmp_path: Path) -> None:

@@ -53,9 +53,8 @@ def lerobot_robot(folder: Path, preprocessor: Mapping[str, Any], options: Option
     options.refuse_data_config(pipeline.where)
     taking, giving = pipeline.pack.config, pipeline.unpack.config
     tag = str(taking.get("embodiment_tag", "new_embodiment"))
-    embodiment_id = _ids(pipeline.where, pipeline.pack.name, taking).get(
-        tag, 0
-    )  # as lerobot does with an unknown tag
+    # 0 for an unknown tag, as in lerobot.
+    embodiment_id = _ids(pipeline.where, pipeline.pack.name, taking).get(tag, 0)
     options.check_only(tag, embodiment_id, "n1.7" if pipeline.is_n17 else "n1.5", pipeline.where)
     builder = Builder(pipeline.where, np.float32)
     for step in (pipeline.pack, pipeline.unpack):
