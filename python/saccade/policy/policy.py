@@ -32,8 +32,8 @@ class Policy:
     :meth:`from_pretrained` loads a whole checkpoint: camera frames and an instruction in, the robot's actions
     out. ``Policy(head)`` makes a policy without a backbone, which is called with backbone features.
 
-    A policy is immutable and keeps nothing of the observations that it was given: any number of threads may
-    call it at the same time. The actions for an observation have the same bits alone and in any batch.
+    No call changes the result of another, and any number of threads may call a policy at the same time. Of
+    observations it keeps the token ids of the last prompts, and nothing else. The actions for an observation have the same bits alone and in any batch.
 
     Args:
         head: The action head.
