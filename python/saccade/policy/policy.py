@@ -33,7 +33,8 @@ class Policy:
     out. ``Policy(head)`` makes a policy without a backbone, which is called with backbone features.
 
     No call changes the result of another, and any number of threads may call a policy at the same time. Of
-    observations it keeps the token ids of the last prompts, and nothing else. The actions for an observation have the same bits alone and in any batch.
+    observations it keeps the token ids of the last prompts and nothing else. The actions for an observation
+    have the same bits alone and in any batch.
 
     Args:
         head: The action head.
