@@ -179,9 +179,7 @@ def test_it_is_said_where_lerobot_is_faster_in_float32(seconds: float, said: boo
     sentence = policy_report.faster_in_float32(results, CASE)
     assert bool(sentence) == said
     if said:
-        assert (
-            "saccade bfloat16 is 1.35 and 1.35 x as fast, saccade int8 is 2.70 and 2.70 x as fast" in sentence
-        )
+        assert "(1 view and 2 views): saccade bfloat16 ~1.35 x and ~1.35 x; saccade int8 ~2.70 x" in sentence
         assert sentence in policy_report.page([results])
 
 

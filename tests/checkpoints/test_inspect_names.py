@@ -30,7 +30,7 @@ def test_names_of_a_pipeline_are_those_that_its_policy_has(
     (pack,) = (step["config"] for step in values["steps"] if "embodiment_mapping" in step["config"])
     pack["embodiment_mapping"] = given
     names = {}
-    for tag in ("new_embodiment", "gr1", "oxe_droid", "never_heard_of"):
+    for tag in ("new_embodiment", "gr1", "unitree_g1", "genie1_gripper", "never_heard_of"):
         pack["embodiment_tag"] = tag
         path.write_text(json.dumps(values))
         names[tag] = saccade.Normalizer.from_pretrained(source).embodiment_id
@@ -54,11 +54,13 @@ def test_names_that_a_checkpoint_brings_come_first(tmp_path: Path) -> None:
     assert names[10] == ["new_embodiment"]
     assert names[31] == []
     (folder / "embodiment_id.json").write_text('{"x": 7, "new_embodiment": 11}')
-    assert names_of(folder)[7] == ["x"]
+    assert "x" in names_of(folder)[7]
     names = names_of(moved(folder))
-    assert names[7] == ["x"]
+    assert "x" in names[7]
     assert saccade.Normalizer.from_pretrained(folder, "new_embodiment").embodiment_id == 11
-    assert names[11] == ["new_embodiment"]
+    assert "new_embodiment" in names[11]
+    assert "new_embodiment" not in names[10]
+    assert names[2] == ["libero_sim"]  # the loader takes what the file lacks from the released table
     (folder / "processor" / "embodiment_id.json").unlink()
     assert names_of(folder)[10][0] == "new_embodiment"  # the released ones
 

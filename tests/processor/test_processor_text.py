@@ -6,6 +6,7 @@ import re
 import sys
 import unicodedata
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 
 import hypothesis
 import numpy as np
@@ -84,3 +85,20 @@ def test_texts_are_those_of_the_package(processor: saccade.Processor) -> None:
     ids = list(package.get_vocab(with_added_tokens=True).values())
     expected = [package.decode([one], skip_special_tokens=False) for one in ids]
     assert processor.texts(ids) == expected
+
+
+def test_texts_that_come_again_have_the_ids_of_the_crate() -> None:
+    """Ids of the last texts are kept: more texts than that, a long one, and several threads."""
+    crate = tokenizers.Tokenizer.from_file(str(TOKENIZER))
+    texts = [f"open drawer {number}" for number in range(40)] + ["close it " * 3000]
+    expected = {text: crate.encode(text, add_special_tokens=False).ids for text in texts}
+    processor = saccade.Processor("n1.5", TOKENIZER, image_size=14)
+    asked = [text for text in texts for _ in range(2)] + texts[::-1] + texts[:3] * 20
+
+    def check(start: int) -> bool:
+        return all(
+            processor.tokens(text).tolist() == expected[text] for text in asked[start:] + asked[:start]
+        )
+
+    with ThreadPoolExecutor(4) as pool:
+        assert all(pool.map(check, range(0, 40, 10)))

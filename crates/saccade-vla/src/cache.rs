@@ -34,7 +34,9 @@ impl<K: Eq, V> Cache<K, V> {
             return Ok(value);
         }
         let value = Arc::new(compute()?);
-        if let Ok(mut entries) = self.entries.try_lock() {
+        if let Ok(mut entries) = self.entries.try_lock()
+            && entries.iter().all(|(known, _)| *known != key)
+        {
             if entries.len() == self.capacity {
                 entries.pop_front();
             }

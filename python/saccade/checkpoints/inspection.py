@@ -25,7 +25,6 @@ from saccade.checkpoints.whole import backbone_of, robots_of
 from saccade.errors import CheckpointError, InputError
 from saccade.head.config import to_json
 from saccade.robots import DataConfigLike
-from saccade.robots.embodiments import IDS
 from saccade.robots.reading import embodiment_ids
 
 
@@ -138,12 +137,11 @@ def _outside(description: Description) -> dict[str, Counts]:
 
 
 def _embodiment_names(description: Description) -> dict[int, list[str]]:
-    """Names of each id from the checkpoint's files, or else from the released code."""
+    """Names of each id, as the loader takes them."""
     path = Path(description.source)
     first = description.files[0].path if description.files else path
     folder = path if path.is_dir() else Path(first).parent
     names: dict[int, list[str]] = {}
-    found = embodiment_ids(folder)
-    for name, index in (IDS[description.version] if found is None else found).items():
+    for name, index in embodiment_ids(folder, description.version).items():
         names.setdefault(index, []).append(name)
     return names

@@ -32,9 +32,9 @@ class Policy:
     :meth:`from_pretrained` loads a whole checkpoint: camera frames and an instruction in, the robot's actions
     out. ``Policy(head)`` makes a policy without a backbone, which is called with backbone features.
 
-    No call changes the result of another, and any number of threads may call a policy at the same time. Of
-    observations it keeps the token ids of the last prompts and nothing else. The actions for an observation
-    have the same bits alone and in any batch.
+    No call changes the result of another, and any number of threads may call a policy at the same time. It
+    keeps recent instructions, which are tokenized once, and no images, states or actions. The actions for an
+    observation have the same bits alone and in any batch.
 
     Args:
         head: The action head.

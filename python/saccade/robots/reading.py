@@ -17,7 +17,7 @@ from saccade._internal.small_files import read_json
 from saccade.errors import CheckpointError, InputError
 from saccade.robots.building import Builder, Options, size_of, value_at
 from saccade.robots.data_configs import data_config
-from saccade.robots.embodiments import N15_IDS
+from saccade.robots.embodiments import IDS, N15_IDS
 from saccade.robots.isaac_metadata import metadata_robot
 from saccade.robots.isaac_processor import CLASSES, checked_ids, processor_robot
 from saccade.robots.lerobot import lerobot_robot, pipeline_ids
@@ -71,14 +71,14 @@ def processor_version(folder: Path, values: Mapping[str, Any]) -> str | None:
     return MODEL_TYPES.get(str(read_json(folder / "config.json").get("model_type")))
 
 
-def embodiment_ids(folder: Path) -> Mapping[str, int] | None:
-    """Ids by tag as :func:`read` takes them from the files of a checkpoint; None without such a file.
+def embodiment_ids(folder: Path, version: str) -> Mapping[str, int]:
+    """Ids by tag as :func:`read` takes them for a checkpoint: its own, and released ones of other tags.
 
     Raises:
         CheckpointError: A file is damaged.
     """
     found = pipeline_ids(folder)
-    return found if found is not None else _processor_ids(folder) or None
+    return {**IDS[version], **_processor_ids(folder)} if found is None else found
 
 
 def _from_path(path: Path, options: Options) -> Robot:

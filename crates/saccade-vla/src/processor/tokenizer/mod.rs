@@ -27,7 +27,7 @@ pub use find::TokenizerFiles;
 /// Longer text is refused before it is looked at: no model takes as many tokens, and the pattern gives up on a million spaces.
 const MAX_TEXT_BYTES: usize = 1 << 18;
 
-/// Texts whose ids are kept: a farm has several tasks, and guidance two prompts for each.
+/// Texts whose ids are kept: a server has several tasks at a time, and guidance two prompts for each.
 const RECENT_TEXTS: usize = 16;
 
 /// Bytes of the longest of them.
