@@ -47,11 +47,11 @@ def moved(folder: Path) -> Path:
     return folder
 
 
-def test_names_that_a_checkpoint_brings_come_first(tmp_path: Path) -> None:
+def test_names_are_by_the_ids_that_the_loader_takes(tmp_path: Path) -> None:
     folder = layouts.write(tmp_path / "n17", "n17")
     names = names_of(folder)
     assert names[2] == ["libero_sim"]
-    assert names[10] == ["new_embodiment"]
+    assert "new_embodiment" in names[10]
     assert names[31] == []
     (folder / "embodiment_id.json").write_text('{"x": 7, "new_embodiment": 11}')
     assert "x" in names_of(folder)[7]
