@@ -247,6 +247,33 @@ impl<S: Sums> Kernel for AlongWidth<'_, S> {
     }
 }
 
+/// The image summed along the width and then along the height, by `sums(from, to)`. A pass that would change no size is left out.
+fn resized<S: Sums>(
+    isa: Isa,
+    image: Image<'_>,
+    height: usize,
+    width: usize,
+    sums: impl Fn(usize, usize) -> Result<S, AllocError>,
+) -> Result<Vec<S::Value>, AllocError> {
+    let narrow = match image.width == width {
+        true => unsummed::<S>(image)?,
+        false => along_width(isa, &sums(image.width, width)?, image)?,
+    };
+    match image.height == height {
+        true => Ok(narrow),
+        false => along_height(isa, &sums(image.height, height)?, &narrow, width),
+    }
+}
+
+/// The bytes of the image as they go into a sum.
+fn unsummed<S: Sums>(image: Image<'_>) -> Result<Vec<S::Value>, AllocError> {
+    let mut values = reserved(area(image.height, image.width)?)?;
+    for row in 0..image.height {
+        values.extend(image.row(row).iter().map(|&byte| S::value(byte)));
+    }
+    Ok(values)
+}
+
 /// The image with every row summed along the width: `height` rows of `3 * num_outputs` values.
 fn along_width<S: Sums>(isa: Isa, sums: &S, image: Image<'_>) -> Result<Vec<S::Value>, AllocError> {
     let mut turned = blank(area(image.width, BLOCK)?)?;

@@ -3,7 +3,7 @@
 //! Equation 44 of docs/equations.md.
 
 use super::taps::Taps;
-use super::{Image, Sums, along_height, along_width, area, blank, reserved, sum_rows};
+use super::{Image, Sums, blank, reserved, resized, sum_rows};
 use crate::aligned::AllocError;
 use crate::isa::Isa;
 
@@ -58,28 +58,11 @@ pub fn resize_linear_f32(
     width: usize,
 ) -> Result<FloatImage, AllocError> {
     assert!(height > 0 && width > 0);
-    let narrow = match image.width == width {
-        true => values(image)?,
-        false => along_width(isa, &Linear::new(image.width, width)?, image)?,
-    };
-    let pixels = match image.height == height {
-        true => narrow,
-        false => along_height(isa, &Linear::new(image.height, height)?, &narrow, width)?,
-    };
     Ok(FloatImage {
-        pixels,
+        pixels: resized(isa, image, height, width, Linear::new)?,
         height,
         width,
     })
-}
-
-/// `image / 255`.
-fn values(image: Image<'_>) -> Result<Vec<f32>, AllocError> {
-    let mut values = reserved(area(image.height, image.width)?)?;
-    for row in 0..image.height {
-        values.extend(image.row(row).iter().map(|&byte| Linear::value(byte)));
-    }
-    Ok(values)
 }
 
 /// The sums of one axis.
@@ -141,6 +124,7 @@ impl Sums for Linear {
 
 #[cfg(test)]
 mod tests {
+    use super::super::{along_height, along_width};
     use super::*;
 
     #[test]

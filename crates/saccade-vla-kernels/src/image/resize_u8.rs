@@ -3,7 +3,7 @@
 //! Equations 42 and 43 of docs/equations.md.
 
 use super::taps::Taps;
-use super::{Image, Sums, TOGETHER, along_height, along_width};
+use super::{Image, Sums, TOGETHER, resized};
 use crate::aligned::AllocError;
 use crate::isa::Isa;
 
@@ -98,15 +98,8 @@ fn resize_u8(
     rule: WeightRounding,
 ) -> Result<Vec<u8>, AllocError> {
     assert!(height > 0 && width > 0);
-    let narrow = match image.width == width {
-        true => image.to_vec()?,
-        false => along_width(isa, &Weighted::new(image.width, width, filter, rule)?, image)?,
-    };
-    if image.height == height {
-        return Ok(narrow);
-    }
-    let sums = Weighted::new(image.height, height, filter, rule)?;
-    along_height(isa, &sums, &narrow, width)
+    let sums = |from, to| Weighted::new(from, to, filter, rule);
+    resized(isa, image, height, width, sums)
 }
 
 /// The sums of one axis.
