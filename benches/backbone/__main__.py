@@ -1,6 +1,6 @@
 """The vision-language backbone: speed against transformers, reuse, memory, errors.
 
-`report --write` writes docs/results/backbone.md and benches/backbone/results.json.
+`report --write` writes docs/results/backbone.md and a file in benches/backbone/results/.
 
     python -m benches.backbone                        all sections; about half an hour on two cores
     python -m benches.backbone speed --rounds 9       some sections: speed, reuse, memory, accuracy
@@ -27,7 +27,6 @@ from benches import checkpoints
 from benches.backbone import accuracy, memory, report, reuse, setup
 from benches.backbone.contenders import GROUPS, Task, contenders, note, round_of
 from benches.files import write_record
-from benches.pages.report import report as write_report
 from benches.peers import machine
 from saccade._internal.small_files import read_json
 from saccade.errors import InputError
@@ -43,9 +42,7 @@ def main(arguments: list[str] | None = None) -> int:
     args = parse(arguments)
     path = args.work / ("results-small.json" if args.small else "results.json")
     if args.sections == ["report"]:
-        return write_report(
-            path, report.COMMITTED, report.PAGE, report.document, program="benches.backbone", write=args.write
-        )
+        return report.report(path, write=args.write)
     results: Results = read_json(path, InputError) if path.exists() else {}
     results["machine"] = machine.describe()
     results["machine"]["versions"]["transformers"] = machine.version("transformers")
@@ -54,7 +51,7 @@ def main(arguments: list[str] | None = None) -> int:
         measured = {"speed": speed, "reuse": reuse_section, "memory": memory_section, "accuracy": errors}
         results[section] = measured[section](args)
         write_record(path, results)
-    print(report.document(results))
+    print(report.page([results]))
     return 0
 
 

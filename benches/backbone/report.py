@@ -1,21 +1,25 @@
-"""The report docs/results/backbone.md, from the JSON of the measurements."""
+"""The report docs/results/backbone.md, from the JSON of the measurements of each machine."""
 
 from __future__ import annotations
 
+import json
 import statistics
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 from benches.backbone import memory, reuse
 from benches.backbone.work import backbone_work, floor_seconds
-from benches.peers.results import TOLERANCE
+from benches.files import write_record, write_text
+from benches.pages.report import require_commit
+from benches.peers.results import TOLERANCE, rounded, slug
 from benches.peers.text import plural, table
 from saccade_lab.backbone_sizes import BackboneSizes
 from saccade_lab.timing import Machine, quartiles
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "results" / "backbone.md"
-COMMITTED = Path(__file__).with_name("results.json")
+RECORDS = Path(__file__).with_name("results")
+"""The committed measurements, a JSON file per CPU family."""
 
 #: Contender, the peer that it is compared with, the ratio to reach, and the ratio beyond.
 GOALS = (
@@ -27,25 +31,55 @@ GOALS = (
 Results = dict[str, Any]
 
 
-def document(results: Results) -> str:
-    """The whole page."""
+def report(measured: Path, *, write: bool) -> int:
+    """Prints the page of the committed measurements and of `measured`, if that exists; or writes the page and
+    keeps `measured` under the name of its machine, in place of what was measured there before.
+
+    Returns:
+        The exit status.
+
+    Raises:
+        SystemExit: Nothing is measured yet.
+        UncommittedError: `write`, and the measurements are of a tree with uncommitted changes.
+    """
+    paths = [*sorted(RECORDS.glob("*.json")), *([measured] if measured.exists() else [])]
+    if not paths:
+        raise SystemExit("benches.backbone: nothing measured yet; run python -m benches.backbone")
+    found = {path: json.loads(path.read_text()) for path in paths}
+    by_machine = {name_of(results): results for results in found.values()}
+    text = page([by_machine[name] for name in sorted(by_machine)])
+    if not write:
+        print(text, end="")
+        return 0
+    for path, results in found.items():
+        require_commit(results, path)
+    if measured in found:
+        name = slug(name_of(found[measured]))
+        write_record(RECORDS / f"{name}.json", rounded(found[measured]))
+    write_text(PAGE, text)
+    print(PAGE)
+    return 0
+
+
+def page(measured: Sequence[Results]) -> str:
+    """The whole page: every section of all machines that it was measured on."""
     parts = [
         "# The backbone, measured",
-        "Written by `python -m benches.backbone report --write` from `benches/backbone/results.json`, which "
-        "`python -m benches.backbone` measured on the machine below: N1.5 at its published size with seeded "
-        "random weights, medians with quartiles.",
-        machine(results["machine"]),
+        "N1.5 at its published size with seeded random weights, medians with quartiles. "
+        "`python -m benches.backbone` measures a machine; `python -m benches.backbone report --write` keeps "
+        "its numbers in `benches/backbone/results/`, one file per CPU family, and writes this page from all.",
+        "\n".join(f"- **{name_of(results)}**: {machine(results['machine'])}" for results in measured),
     ]
-    titles = {
-        "speed": ("## Speed", speed),
-        "reuse": ("## Unchanged views", unchanged),
-        "memory": ("## Memory and loading", loading),
-        "accuracy": ("## Errors", errors),
-    }
-    for section, (title, write) in titles.items():
-        if results.get(section):
-            parts += [title, *write(results)]
+    for section, (title, what, write) in SECTIONS.items():
+        found = [results for results in measured if results.get(section)]
+        if found:
+            parts += [f"## {title}", what, *(part for results in found for part in write(results))]
     return "\n\n".join(parts) + "\n"
+
+
+def name_of(results: Results) -> str:
+    """The name of the CPU's family."""
+    return str(results["machine"]["name"])
 
 
 def machine(held: Results) -> str:
@@ -63,19 +97,12 @@ def machine(held: Results) -> str:
 
 def speed(results: Results) -> Iterator[str]:
     """Tables by thread count and number of views, and the goals."""
-    yield (
-        "The backbone alone: pixels and token ids in, features out, the prompt `open the drawer`. "
-        "transformers is SigLIP, a linear layer and Qwen3 with 12 layers, without logits, pooling head and "
-        "cache, all tensors in the named dtype. The floor is the longer of two times: the multiply-adds at "
-        "the peak of the arithmetic, measured in the same rounds, and the weights at the memory's bandwidth. "
-        "The error is the largest difference from the reference in float32, relative to the largest feature."
-    )
     goals: list[list[str]] = []
     for entry in results["speed"]:
         peak = peaks(entry, results["machine"]["isa"])
         rates = ", ".join(f"{kind} {rate / 1e9:.0f}" for kind, rate in peak.macs_per_second.items())
         group = "" if entry["group"] == "usual" else ", with torch.compile"
-        yield f"### {plural(entry['threads']).capitalize()}{group}"
+        yield f"### {name_of(results)}, {plural(entry['threads'])}{group}"
         yield f"Peaks: {rates} GMAC/s, {peak.read_bytes_per_second / 1e9:.0f} GB/s."
         rows = list(speed_rows(entry, peak))
         yield table(["ms", "views", "median (quartiles)", "share of the floor", "error"], rows)
@@ -88,7 +115,7 @@ def speed(results: Results) -> Iterator[str]:
             yield " ".join(failed)
         goals += goal_rows(entry)
     if goals:
-        yield "### Targets"
+        yield f"### {name_of(results)}, targets"
         yield table(["", "views", "threads", "times as fast", "target", "beyond"], goals)
 
 
@@ -160,10 +187,7 @@ def goal_rows(entry: Results) -> Iterator[list[str]]:
 
 def unchanged(results: Results) -> Iterator[str]:
     """Time and share of a full step of each kind of step."""
-    yield (
-        "A whole policy with two views, head included: `encode` with the previous context and `sample`. The "
-        "percentage is the share of a full step in the same round."
-    )
+    yield f"### {name_of(results)}"
     rows = []
     for entry in results["reuse"]:
         full = entry["seconds"]["full step"]
@@ -189,12 +213,7 @@ def unchanged(results: Results) -> Iterator[str]:
 
 def loading(results: Results) -> Iterator[str]:
     """Peaks of memory, and cold loads against reading the files."""
-    yield (
-        "Peak memory of the process (`VmHWM`) in 10^9 bytes, and seconds of loading with the page cache "
-        "dropped, against reading all tensor files. The policy holds one embodiment. Targets: "
-        + ", ".join(f"{precision} at most {goal} GB" for precision, goal in memory.GOALS.items())
-        + f" loaded, and a load of at most {memory.LOAD_GOAL} times the reading."
-    )
+    yield f"### {name_of(results)}"
     rows = []
     for entry in results["memory"]:
         runs = entry["runs"]
@@ -221,13 +240,7 @@ def loading(results: Results) -> Iterator[str]:
 
 def errors(results: Results) -> Iterator[str]:
     """Errors against float64."""
-    yield (
-        'Features of one view against the reference in float64. "Largest" is the largest error over the '
-        'largest feature, "rms" the root-mean-square error over that of the features, "worst token" the '
-        'largest rms error of a token over the token\'s rms. "Outliers" has four channels of 40 in the '
-        "vision tower's residual stream and four inputs of every down projection that are 32 times as large "
-        "as the others. transformers in bfloat16 is what the released code computes."
-    )
+    yield f"### {name_of(results)}"
     rows = []
     for entry in results["accuracy"]:
         layers = "" if entry["layers"] is None else f", {entry['layers'][0]} + {entry['layers'][1]} layers"
@@ -245,3 +258,40 @@ def spread(seconds: list[float]) -> str:
     """Median and quartiles in milliseconds."""
     first, median, third = (1e3 * each for each in quartiles(seconds))
     return f"{median:.0f} ({first:.0f} to {third:.0f})"
+
+
+#: What was measured, by its key in the records: title, what is measured, and the parts of one machine.
+SECTIONS: dict[str, tuple[str, str, Callable[[Results], Iterator[str]]]] = {
+    "speed": (
+        "Speed",
+        "The backbone alone: pixels and token ids in, features out, the prompt `open the drawer`. "
+        "transformers is SigLIP, a linear layer and Qwen3 with 12 layers, without logits, pooling head and "
+        "cache, all tensors in the named dtype. The floor is the longer of two times: the multiply-adds at "
+        "the peak of the arithmetic, measured in the same rounds, and the weights at the memory's bandwidth. "
+        "The error is the largest difference from the reference in float32, relative to the largest feature.",
+        speed,
+    ),
+    "reuse": (
+        "Unchanged views",
+        "A whole policy with two views, head included: `encode` with the previous context and `sample`. The "
+        "percentage is the share of a full step in the same round.",
+        unchanged,
+    ),
+    "memory": (
+        "Memory and loading",
+        "Peak memory of the process (`VmHWM`) in 10^9 bytes, and seconds of loading with the page cache "
+        "dropped, against reading all tensor files. The policy holds one embodiment. Targets: "
+        + ", ".join(f"{precision} at most {goal} GB" for precision, goal in memory.GOALS.items())
+        + f" loaded, and a load of at most {memory.LOAD_GOAL} times the reading.",
+        loading,
+    ),
+    "accuracy": (
+        "Errors",
+        'Features of one view against the reference in float64. "Largest" is the largest error over the '
+        'largest feature, "rms" the root-mean-square error over that of the features, "worst token" the '
+        'largest rms error of a token over the token\'s rms. "Outliers" has four channels of 40 in the '
+        "vision tower's residual stream and four inputs of every down projection that are 32 times as large "
+        "as the others. transformers in bfloat16 is what the released code computes.",
+        errors,
+    ),
+}

@@ -65,7 +65,7 @@ class Results:
     @property
     def slug(self) -> str:
         """`cpu` as a file name, such as `zen-4`."""
-        return re.sub(r"[^a-z0-9]+", "-", self.cpu.lower()).strip("-")
+        return slug(self.cpu)
 
     @property
     def cases(self) -> list[Case]:
@@ -154,6 +154,11 @@ class Results:
         ]
         known = [value for value in values if value]
         return statistics.median(known) if known else None
+
+
+def slug(cpu: str) -> str:
+    """The name of a CPU's family as a file name: `zen-4` of `Zen 4`."""
+    return re.sub(r"[^a-z0-9]+", "-", cpu.lower()).strip("-")
 
 
 def times(entry: dict[str, Any], work: str) -> list[float]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ import saccade._saccade as _saccade
 from benches.backbone import __main__ as program
 from benches.backbone import accuracy, memory, peer, report, setup
 from benches.backbone.work import backbone_work, floor_seconds
+from benches.pages.report import UncommittedError
 from benches.work import total
 from saccade_lab import random_checkpoint
 from saccade_lab.backbone_sizes import BackboneSizes
@@ -99,6 +101,7 @@ def test_the_page(checkpoint: Path) -> None:
     results: dict[str, Any] = {
         "machine": {
             "cpu": "A CPU",
+            "name": "A family",
             "family": "family 1",
             "isa": "avx512",
             "cores": 2,
@@ -154,7 +157,7 @@ def test_the_page(checkpoint: Path) -> None:
             }
         ],
     }
-    page = report.document(results)
+    page = report.page([results])
     # The wrong setting of transformers is faster and is not the one that is compared with.
     assert (
         "| saccade bfloat16 against transformers bfloat16 (sdpa) | 1 | 2 | 2.00 (2.00 to 2.00) | 1.3 | 1.8 |"
@@ -165,6 +168,35 @@ def test_the_page(checkpoint: Path) -> None:
     assert "| int8, 2 threads | 1000 (1000 to 1000) | 600 (60 %) | 900 (90 %) | 200 (20 %) |" in page
     assert "| policy, int8 |  | 0.03 | 2.00 | 2.50 | 2.6 | 2.0 | 1.30 |" in page
     assert "| plain | saccade int8 | 1.0e-02 | 2.0e-02 | 3.0e-02 |" in page
+
+
+def test_every_machine_keeps_a_record_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    record = json.loads((report.RECORDS / "zen-4.json").read_text())
+    measured, records, page = (tmp_path / name for name in ("results.json", "records", "page.md"))
+    records.mkdir()
+    monkeypatch.setattr(report, "RECORDS", records)
+    monkeypatch.setattr(report, "PAGE", page)
+    with pytest.raises(SystemExit, match="nothing measured yet"):
+        report.report(measured, write=True)
+    for name in ("Zen 5", "Zen 4", "Zen 4"):
+        record["machine"]["name"] = name
+        measured.write_text(json.dumps(record))
+        assert report.report(measured, write=True) == 0
+    assert sorted(path.name for path in records.iterdir()) == ["zen-4.json", "zen-5.json"]
+    written = page.read_text()
+    assert written.count("The backbone alone") == 1
+    assert written.index("### Zen 4, 2 threads") < written.index("### Zen 5, 2 threads")
+
+    record["machine"]["commit"] += "-dirty"
+    measured.write_text(json.dumps(record))
+    with pytest.raises(UncommittedError):
+        report.report(measured, write=True)
+    assert page.read_text() == written
+
+
+def test_the_page_is_that_of_the_committed_records(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    report.report(tmp_path / "nothing.json", write=False)
+    assert capsys.readouterr().out == report.PAGE.read_text()
 
 
 def test_arguments() -> None:
