@@ -13,7 +13,8 @@ import numpy as np
 import pytest
 
 import saccade
-from saccade import BackboneInputs, Policy, PolicyContext, ShapeError
+import saccade._saccade as _saccade
+from saccade import BackboneInputs, InputError, Policy, PolicyContext, ShapeError
 from saccade.policy.encoding import compute_features, encode_features
 from tests.helpers import whole_checkpoints
 from tests.helpers.policy_cases import inputs_of, noise, with_parts
@@ -115,6 +116,27 @@ def test_own_parts_are_called_once(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(saccade.ActionHead, "encode", refuse)
     found = policy.act(observation, noise=start)
     assert all(np.array_equal(found[key], expected[key]) for key in expected)
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"seed": -1}, "seed: "),
+        ({"seed": 0, "noise": np.zeros((1, 1, 1), np.float32)}, "noise, seed: "),
+        ({"num_samples": 0}, "num_samples: "),
+    ],
+)
+def test_options_that_do_not_fit_are_refused_before_images_are_encoded(
+    options: dict[str, Any], said: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    policy = load("n17")
+
+    def refuse(*args: Any) -> Any:
+        raise AssertionError("something was encoded")
+
+    monkeypatch.setattr(_saccade, "Policy", refuse)
+    with pytest.raises(InputError, match=f"^{said}"):
+        policy.act(seen(policy), **options)
 
 
 def test_a_replaced_method_is_called(monkeypatch: pytest.MonkeyPatch) -> None:

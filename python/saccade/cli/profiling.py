@@ -13,7 +13,7 @@ from saccade.cli.output import Section
 from saccade.policy.encoding import encode_observations
 from saccade.policy.preparing import prepare_inputs
 from saccade.policy.reading import read_observations
-from saccade.policy.sampling import Sampling, sample_actions
+from saccade.policy.sampling import Sampling, sample_from, start_of_batch
 from saccade.policy.units import restore_units
 
 if TYPE_CHECKING:
@@ -25,11 +25,12 @@ CALLS, SECONDS = 5, 2.0
 #: The parts in the order of a call, and what each does. Those of `ARITHMETIC` are the model's own work.
 PARTS = {
     "read": "checking the observation, in Python",
+    "start": "normalising the state, noise",
     "prepare": "resizing images, making tokens",
     "backbone and encode": "products, attention and norms, until the head's keys and values",
     "around them": "crossing to Rust and back, checks, copies",
     "sample": "products, attention and norms of denoising",
-    "around it": "normalising the state, noise, crossing, checks, copies",
+    "around it": "crossing to Rust and back, checks, copies",
     "units": "the robot's units, by name",
 }
 ARITHMETIC = ("backbone and encode", "sample")
@@ -81,23 +82,24 @@ def one_call(policy: Policy, observation: Mapping[str, Any], seed: int, num_step
     preparing = times[0] - started
     batch = read_observations(observation, policy.requirements)
     times.append(time.perf_counter())
+    options = Sampling(seed=seed, num_steps=num_steps)
+    start = start_of_batch(batch, options, policy.head, policy.normalizer)
+    times.append(time.perf_counter())
     with _saccade.profile() as of_encode:
         context = encode_observations(batch, processor, backbone, policy.head)
     times.append(time.perf_counter())
-    options = Sampling(seed=seed, num_steps=num_steps)
     with _saccade.profile() as of_sample:
-        actions = sample_actions(
-            context, batch, options, policy.head, policy.normalizer, policy.embodiment_id
-        )
+        actions = sample_from(start, context, policy.head, policy.embodiment_id)
     times.append(time.perf_counter())
     restore_units(actions, batch, policy.normalizer)
     times.append(time.perf_counter())
-    read, encode, sample, units = (after - before for before, after in itertools.pairwise(times))
+    read, begin, encode, sample, units = (after - before for before, after in itertools.pairwise(times))
     counted = [of_encode.counters(), of_sample.counters()]
     encoding, sampling = (sum(seconds for _, seconds, *_ in one.values()) for one in counted)
     prepare = min(preparing, encode - encoding)
     seconds = {
         "read": read,
+        "start": begin,
         "prepare": prepare,
         "backbone and encode": encoding,
         "around them": encode - encoding - prepare,

@@ -180,7 +180,7 @@ class ActionHead(LoadedHead):
         config = self.config
         leading = (held.batch,) if samples is None else (held.batch, samples)
         output = result((*leading, config.action_horizon, config.action_dim), out)
-        start = noise_or_draw(noise, seed, (*leading, config.action_horizon, config.encoder_action_dim))
+        start = noise_or_draw(noise, seed, config, held.batch, samples)
         self._engine.sample(
             held,
             apart(float32("state", state), output),
@@ -315,7 +315,7 @@ class ActionHead(LoadedHead):
         """
         held = _held(context)
         config = self.config
-        start = noise_or_draw(noise, seed, (held.batch, config.action_horizon, config.encoder_action_dim))
+        start = noise_or_draw(noise, seed, config, held.batch)
         attention, hidden = check_record(record)
         (probabilities, kept_rows), rows, actions = self._engine.trace(
             held,

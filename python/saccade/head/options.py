@@ -19,6 +19,7 @@ from saccade._internal.arrays import (
 )
 from saccade.errors import InputError
 from saccade.head.chunking import Chunking
+from saccade.head.config import HeadConfig
 from saccade.head.intervention import Intervention, as_interventions
 
 #: The parts of a policy that have a precision.
@@ -89,8 +90,13 @@ def is_float32(precision: str | Mapping[str, str]) -> bool:
     return set(precision.values() if isinstance(precision, Mapping) else [precision]) == {"float32"}
 
 
-def noise_or_draw(noise: ArrayLike | None, seed: Any, shape: tuple[int, ...]) -> Float32Array:
-    """The noise that sampling starts from: the given array, or standard normal float32 of this shape.
+def noise_or_draw(
+    noise: ArrayLike | None, seed: Any, config: HeadConfig, batch: int, samples: int | None = None
+) -> Float32Array:
+    """The noise that sampling starts from: the given array, or standard normal float32.
+
+    What is drawn is ``(batch, action_horizon, encoder_action_dim)``, with an axis of samples behind the batch
+    unless ``samples`` is None.
 
     Raises:
         DtypeError, ShapeError: ``noise`` is not a floating point array.
@@ -107,6 +113,8 @@ def noise_or_draw(noise: ArrayLike | None, seed: Any, shape: tuple[int, ...]) ->
         raise InputError(
             f"seed: expected what numpy.random.default_rng takes, got {seed!r} ({error})"
         ) from None
+    leading = (batch,) if samples is None else (batch, samples)
+    shape = (*leading, config.action_horizon, config.encoder_action_dim)
     try:
         return generator.standard_normal(shape, dtype=np.float32)
     except (MemoryError, ValueError):

@@ -99,9 +99,9 @@ def encode_observations(
     """The context of each row of observations; ``previous`` as in :meth:`saccade.Policy.encode`."""
     # Others may compute in their own way.
     if not (
-        _is_own(processor, Processor)
-        and _is_own(backbone, Backbone)
-        and _is_own(head, ActionHead)
+        is_own(processor, Processor)
+        and is_own(backbone, Backbone)
+        and is_own(head, ActionHead)
         and (previous is None or _is_own_context(previous))
     ):
         return encode_features(compute_features(prepare_inputs(parsed, processor), backbone, previous), head)
@@ -134,7 +134,7 @@ def compute_features(
 
 def encode_features(features: Sequence[BackboneFeatures], head: Head) -> PolicyContext:
     """The context of features, each a batch of one of any length."""
-    if _is_own(head, ActionHead) and all(type(one) is BackboneFeatures for one in features):
+    if is_own(head, ActionHead) and all(type(one) is BackboneFeatures for one in features):
         use_torch = len(features) == 1 and features[0]._torch
         held = head._engine.encode_features([one._held for one in features])
         return PolicyContext(Context(held, use_torch, None), tuple(features))
@@ -150,7 +150,7 @@ def encode_features(features: Sequence[BackboneFeatures], head: Head) -> PolicyC
     return PolicyContext(context, tuple(features))
 
 
-def _is_own(part: object, kind: type[Part]) -> TypeGuard[Part]:
+def is_own(part: object, kind: type[Part]) -> TypeGuard[Part]:
     """Whether a part is saccade's: not of a subclass, and with no method replaced on the object."""
     return type(part) is kind and not any(map(callable, vars(part).values()))
 

@@ -20,7 +20,7 @@ from saccade.policy.guidance import Without, check_without
 from saccade.policy.interfaces import Head, VisionLanguageBackbone
 from saccade.policy.loading import check_fit, check_name, embodiment_of, load_parts, read_normalizer
 from saccade.policy.reading import Observations, is_observation, read_observations, read_states
-from saccade.policy.sampling import Sampling, sample_actions, sample_state
+from saccade.policy.sampling import Sampling, sample_from, start_of_batch, start_of_state
 from saccade.policy.units import restore_units
 from saccade.processor import Preprocessing, Processor
 from saccade.robots import DataConfigLike, Normalizer
@@ -231,12 +231,13 @@ class Policy:
             if guidance is None:
                 raise InputError(f"without: expected guidance with it, got {without!r} alone")
         batch = read_observations(observation, self.requirements)
+        start = start_of_batch(batch, options, self.head, self.normalizer)
         parts = (processor, backbone, self.head, previous)
         if options.guidance is None:
             encoded = encode_observations(batch, *parts)
         else:
             encoded = encode_with_and_without(batch.parsed, without or "default", *parts)
-        actions = sample_actions(encoded, batch, options, self.head, self.normalizer, self.embodiment_id)
+        actions = sample_from(start, encoded, self.head, self.embodiment_id)
         return restore_units(actions, batch, self.normalizer)
 
     def encode(
@@ -347,7 +348,12 @@ class Policy:
         if not is_observation(observation_or_state):
             return self._sample_state(context, observation_or_state, options)  # type: ignore[arg-type]
         batch = read_states(observation_or_state, self.requirements)  # type: ignore[arg-type]
-        actions = sample_actions(context, batch, options, self.head, self.normalizer, self.embodiment_id)
+        if len(batch.state) != context.batch:
+            raise InputError(
+                f"observation: expected {context.batch}, as many as in context, got {len(batch.state)}"
+            )
+        start = start_of_batch(batch, options, self.head, self.normalizer)
+        actions = sample_from(start, context, self.head, self.embodiment_id)
         return restore_units(actions, batch, self.normalizer)
 
     def __call__(
@@ -418,7 +424,8 @@ class Policy:
         return example_observation(self.requirements, self.normalizer, integer("seed", seed, least=0))
 
     def _sample_state(self, context: PolicyContext | Context, state: ArrayLike, options: Sampling) -> Array:
-        actions = sample_state(context, state, options, self.head, self.normalizer, self.embodiment_id)
+        start = start_of_state(state, options, self.head, self.normalizer)
+        actions = sample_from(start, context, self.head, self.embodiment_id)
         return self.normalizer.actions(actions, state)
 
     def _require_backbone(self) -> tuple[Processor, VisionLanguageBackbone]:

@@ -12,9 +12,11 @@ from saccade._internal.arrays import Array, ArrayLike, float32
 from saccade.errors import InputError, ShapeError
 from saccade.head.chunking import Chunking
 from saccade.head.context import Context
+from saccade.head.head import ActionHead
 from saccade.head.intervention import Intervention
+from saccade.head.options import noise_or_draw, optional_integer
 from saccade.observations import ParsedState
-from saccade.policy.encoding import PolicyContext
+from saccade.policy.encoding import PolicyContext, is_own
 from saccade.policy.guidance import check_guides
 from saccade.policy.interfaces import Head
 from saccade.policy.loading import returned_horizon
@@ -39,42 +41,52 @@ class Sampling:
     without: Context | None = None  # the second context, if guidance needs one
 
 
-def sample_actions(
-    context: PolicyContext | Context,
-    batch: Batch[ParsedState],
-    options: Sampling,
-    head: Head,
-    normalizer: Normalizer,
-    embodiment_id: int,
-) -> Array:
-    """Normalised actions for parsed observations, as :meth:`saccade.ActionHead.sample` returns them."""
-    state = batch.state
-    if len(state) != context.batch:
-        raise InputError(f"observation: expected {context.batch}, as many as in context, got {len(state)}")
+@dataclass(frozen=True, eq=False)
+class Start:
+    """What sampling starts from: all of a call that does not depend on its context.
+
+    Attributes:
+        state: The normalised state, as the head takes it.
+        options: The options of the call, as the head takes them.
+    """
+
+    state: Array
+    options: Sampling
+
+
+def start_of_batch(batch: Batch[ParsedState], options: Sampling, head: Head, normalizer: Normalizer) -> Start:
+    """The start of a call with parsed observations.
+
+    :meth:`saccade.Policy.act` takes it before it encodes the images: options that do not fit then cost no
+    time, and it is faster, because the kernels take the caches from the interpreter.
+    """
     if options.previous_chunk is not None:
         options = replace(options, previous_chunk=_joined_chunks(options.previous_chunk, batch, normalizer))
     if options.noise is not None and batch.is_single:
         axes = 3 if options.num_samples is None else 4
         options = replace(options, noise=_with_batch_axis(np.asarray(options.noise), axes, batch.parsed[0]))
-    return sample_state(context, state, options, head, normalizer, embodiment_id)
+    if is_own(head, ActionHead):  # others may draw in their own way
+        samples = optional_integer("num_samples", options.num_samples)
+        noise = noise_or_draw(options.noise, options.seed, head.config, len(batch.state), samples)
+        options = replace(options, noise=noise, seed=None)
+    return start_of_state(batch.state, options, head, normalizer)
 
 
-def sample_state(
-    context: PolicyContext | Context,
-    state: ArrayLike,
-    options: Sampling,
-    head: Head,
-    normalizer: Normalizer,
-    embodiment_id: int,
-) -> Array:
-    """Normalised actions for a state in the robot's units."""
+def start_of_state(state: ArrayLike, options: Sampling, head: Head, normalizer: Normalizer) -> Start:
+    """The start of a call with a state in the robot's units."""
     if options.previous_chunk is not None:
         options = _continued(options, state, head, normalizer)
+    return Start(normalizer.state(state), options)
+
+
+def sample_from(start: Start, context: PolicyContext | Context, head: Head, embodiment_id: int) -> Array:
+    """Normalised actions, as :meth:`saccade.ActionHead.sample` returns them."""
+    options = start.options
     if options.guidance is not None:
         options = replace(options, without=_second(context, head))
     given = {name: value for name, value in vars(options).items() if value is not None}
     held = context.context if isinstance(context, PolicyContext) else context
-    return head.sample(held, normalizer.state(state), embodiment_id, **given)
+    return head.sample(held, start.state, embodiment_id, **given)
 
 
 def _second(context: PolicyContext | Context, head: Head) -> Context:

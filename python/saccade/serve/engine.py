@@ -130,13 +130,12 @@ class Engine:
             self._try(works)
 
     def _begun(self, job: Job) -> _Work:
-        options, config = job.call.options, self._policy.head.config
-        shape = (job.rows, config.action_horizon, config.encoder_action_dim)
+        options = job.call.options
         session = continued = None
         if options.session is not None:
             session = self._sessions.use(options.session, job.client)
             continued = session.continued(options, job.rows)
-        noise = noise_or_draw(None, options.seed, shape)
+        noise = noise_or_draw(None, options.seed, self._policy.head.config, job.rows)
         num_steps = options.num_steps or self._num_steps
         return _Work(job, noise, session, continued, num_steps, self._weight(job))
 
