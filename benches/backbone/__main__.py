@@ -1,17 +1,16 @@
 """The vision-language backbone: speed against transformers, reuse, memory, errors.
 
-`report --write` writes docs/results/backbone.md and a file in benches/backbone/results/.
-
-    python -m benches.backbone                        all sections; about half an hour on two cores
+    python -m benches.backbone                        all sections; about 40 minutes on two cores
     python -m benches.backbone speed --rounds 9       some sections: speed, reuse, memory, accuracy
-    python -m benches.backbone report                 print the report of existing measurements
-    python -m benches.backbone report --write         write docs/results/backbone.md and keep the measurements
+    python -m benches.backbone report                 print the page of all committed records
+    python -m benches.backbone report --write         write docs/results/backbone.md from them
     python -m benches.backbone --small --rounds 2     a quick trial of the program itself
 
 The checkpoint is random, at N1.5's published size; it is written once, 4.8 GB. In `speed` every contender has
 a process of its own and they take turns: in a round each does every piece once, in an order that rotates.
 Before anything is timed, features are compared with the reference in float32. Run it on an idle machine with
-24 GB of memory; `accuracy` needs 12 GB for float64. A section that runs again replaces its results.
+24 GB of memory; `accuracy` needs 12 GB for float64. A section that runs again replaces its results. At the
+end the results are copied to benches/backbone/results/ under the name of the CPU's family.
 """
 
 from __future__ import annotations
@@ -28,10 +27,10 @@ from benches.backbone import accuracy, memory, report, reuse, setup
 from benches.backbone.contenders import GROUPS, Task, contenders, note, round_of
 from benches.files import write_record
 from benches.peers import machine
+from benches.peers.results import set_aside
 from saccade._internal.small_files import read_json
 from saccade.errors import InputError
 
-SECTIONS = ("speed", "reuse", "memory", "accuracy")
 PRECISIONS = ("float32", "bfloat16", "int8")
 
 Results = dict[str, Any]
@@ -42,16 +41,21 @@ def main(arguments: list[str] | None = None) -> int:
     args = parse(arguments)
     path = args.work / ("results-small.json" if args.small else "results.json")
     if args.sections == ["report"]:
-        return report.report(path, write=args.write)
+        return report.report(write=args.write)
     results: Results = read_json(path, InputError) if path.exists() else {}
-    results["machine"] = machine.describe()
-    results["machine"]["versions"]["transformers"] = machine.version("transformers")
+    machine_now = machine.describe()
+    if set_aside(path, results.get("machine", {}), machine_now):
+        note(f"{path} is from another machine or build; it is set aside and measured again")
+        results = {}
+    results["machine"] = machine_now
     args.work.mkdir(parents=True, exist_ok=True)
     for section in args.sections:
         measured = {"speed": speed, "reuse": reuse_section, "memory": memory_section, "accuracy": errors}
         results[section] = measured[section](args)
         write_record(path, results)
     print(report.page([results]))
+    if not args.small:
+        print(report.keep(results, path))
     return 0
 
 
@@ -131,7 +135,9 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
         description=__doc__,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("sections", nargs="*", metavar="SECTION", help=f"default: {' '.join(SECTIONS)}")
+    parser.add_argument(
+        "sections", nargs="*", metavar="SECTION", help=f"default: {' '.join(report.SECTIONS)}"
+    )
     cores = len(os.sched_getaffinity(0))
     parser.add_argument(
         "--threads", type=int, nargs="+", default=list(dict.fromkeys((2, cores))), help="default: 2 and all"
@@ -150,10 +156,10 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
     parser.add_argument("--small", action="store_true", help="small sizes, for a quick trial")
     parser.add_argument("--write", action="store_true", help="report: write docs/results/backbone.md")
     args = parser.parse_args(arguments)
-    args.sections = args.sections or list(SECTIONS)
-    if not set(args.sections) <= set(SECTIONS) and args.sections != ["report"]:
+    args.sections = args.sections or list(report.SECTIONS)
+    if not set(args.sections) <= set(report.SECTIONS) and args.sections != ["report"]:
         parser.error(
-            f"expected sections among {', '.join(SECTIONS)}, or report, got {' '.join(args.sections)}"
+            f"expected sections among {', '.join(report.SECTIONS)}, or report, got {' '.join(args.sections)}"
         )
     if args.rounds < 1 or args.loads < 1 or min(args.threads) < 1 or min(args.views) < 1:
         parser.error("--rounds, --loads, --threads and --views must be at least 1")

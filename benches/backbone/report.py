@@ -1,4 +1,4 @@
-"""The report docs/results/backbone.md, from the JSON of the measurements of each machine."""
+"""The report docs/results/backbone.md, from one JSON record per machine."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from benches.backbone import memory, reuse
 from benches.backbone.work import backbone_work, floor_seconds
 from benches.files import write_record, write_text
 from benches.pages.report import require_commit
+from benches.peers.goals import reached
 from benches.peers.results import TOLERANCE, rounded, slug
 from benches.peers.text import plural, table
 from saccade_lab.backbone_sizes import BackboneSizes
@@ -31,44 +32,52 @@ GOALS = (
 Results = dict[str, Any]
 
 
-def report(measured: Path, *, write: bool) -> int:
-    """Prints the page of the committed measurements and of `measured`, if that exists; or writes the page and
-    keeps `measured` under the name of its machine, in place of what was measured there before.
-
-    Returns:
-        The exit status.
+def keep(results: Results, path: Path) -> Path:
+    """Writes the measurements of `path` to the record of this CPU's family, and returns its file.
 
     Raises:
-        SystemExit: Nothing is measured yet.
-        UncommittedError: `write`, and the measurements are of a tree with uncommitted changes.
+        UncommittedError: They are of a tree with uncommitted changes.
+        SystemExit: They lack a section of the record that they would replace.
     """
-    paths = [*sorted(RECORDS.glob("*.json")), *([measured] if measured.exists() else [])]
-    if not paths:
-        raise SystemExit("benches.backbone: nothing measured yet; run python -m benches.backbone")
-    found = {path: json.loads(path.read_text()) for path in paths}
-    by_machine = {name_of(results): results for results in found.values()}
-    text = page([by_machine[name] for name in sorted(by_machine)])
+    require_commit(results, path)
+    kept = RECORDS / f"{slug(name_of(results))}.json"
+    before = json.loads(kept.read_text()) if kept.exists() else {}
+    lost = [section for section in SECTIONS if section in before and section not in results]
+    if lost:
+        raise SystemExit(
+            f"benches.backbone: {kept} has {', '.join(lost)}, which {path} lacks; measure that too"
+        )
+    write_record(kept, rounded(results))
+    return kept
+
+
+def report(*, write: bool) -> int:
+    """Prints the page of the committed records, or writes it. Returns the exit status.
+
+    Raises:
+        UncommittedError: `write`, and a record is of a tree with uncommitted changes.
+    """
+    found = {path: json.loads(path.read_text()) for path in RECORDS.glob("*.json")}
+    text = page(sorted(found.values(), key=name_of))
     if not write:
         print(text, end="")
         return 0
     for path, results in found.items():
         require_commit(results, path)
-    if measured in found:
-        name = slug(name_of(found[measured]))
-        write_record(RECORDS / f"{name}.json", rounded(found[measured]))
     write_text(PAGE, text)
     print(PAGE)
     return 0
 
 
 def page(measured: Sequence[Results]) -> str:
-    """The whole page: every section of all machines that it was measured on."""
+    """The whole page: each section, with every machine that has it."""
     parts = [
         "# The backbone, measured",
-        "N1.5 at its published size with seeded random weights, medians with quartiles. "
-        "`python -m benches.backbone` measures a machine; `python -m benches.backbone report --write` keeps "
-        "its numbers in `benches/backbone/results/`, one file per CPU family, and writes this page from all.",
-        "\n".join(f"- **{name_of(results)}**: {machine(results['machine'])}" for results in measured),
+        "N1.5 at its published size with seeded random weights. Nothing else ran on the machines. "
+        "`python -m benches.backbone` measures a machine and keeps the numbers in "
+        "`benches/backbone/results/`, one file per CPU family; `python -m benches.backbone report --write` "
+        "writes this page from these files.",
+        "\n".join(machine(results) for results in measured),
     ]
     for section, (title, what, write) in SECTIONS.items():
         found = [results for results in measured if results.get(section)]
@@ -82,16 +91,19 @@ def name_of(results: Results) -> str:
     return str(results["machine"]["name"])
 
 
-def machine(held: Results) -> str:
-    """The machine in one sentence."""
+def machine(results: Results) -> str:
+    """The machine, what was measured on it, and with what."""
+    held = results["machine"]
+    sections = ", ".join(title.lower() for section, (title, *_) in SECTIONS.items() if results.get(section))
     versions = ", ".join(
         f"{name} {held['versions'][name]}"
         for name in ("saccade", "torch", "transformers", "numpy")
         if held["versions"].get(name)
     )
     return (
-        f"{held['cpu']} ({held['family']}, {held['isa']}), {held['cores']} cores, {held['memory_gb']} GB, "
-        f"Linux {held['kernel']}; flags {', '.join(held['flags'])}. {versions}; commit {held['commit']}."
+        f"- **{held['name']}** ({sections}): {held['cpu']} ({held['family']}, {held['isa']}), "
+        f"{held['cores']} cores, {held['memory_gb']} GB, Linux {held['kernel']}; flags "
+        f"{', '.join(held['flags'])}. {versions}; commit {held['commit']}."
     )
 
 
@@ -116,7 +128,7 @@ def speed(results: Results) -> Iterator[str]:
         goals += goal_rows(entry)
     if goals:
         yield f"### {name_of(results)}, targets"
-        yield table(["", "views", "threads", "times as fast", "target", "beyond"], goals)
+        yield table(["", "views", "threads", "times as fast", "target (exceeded at)", "reached"], goals)
 
 
 def peaks(entry: Results, isa: str) -> Machine:
@@ -162,32 +174,50 @@ def is_correct(name: str, measured: Results) -> bool:
 
 
 def goal_rows(entry: Results) -> Iterator[list[str]]:
-    """How many times as fast as transformers' fastest correct setting, in the same rounds."""
+    """How many times as fast as transformers' fastest correct setting of a dtype, in the same rounds.
+
+    Where transformers is faster in float32 than in bfloat16, that is compared with too, without a target.
+    """
+    contenders = entry["contenders"]
     for ours, dtype, goal, beyond in GOALS:
-        contenders = entry["contenders"]
         if ours not in contenders or "failed" in contenders[ours]:
             continue
         for views in contenders[ours]:
-            candidates = [
-                (statistics.median(measured["seconds"]), name, work)
-                for name in (f"transformers-{dtype}", f"compiled-{dtype}")
-                if "failed" not in contenders.get(name, {"failed": ""})
-                for work, measured in contenders[name].items()
-                if work.split(", ")[-1] == views and is_correct(name, measured)
-            ]
-            if not candidates:
-                continue
-            _, name, work = min(candidates)
-            pairs = zip(contenders[name][work]["seconds"], contenders[ours][views]["seconds"], strict=True)
-            first, median, third = quartiles(theirs / mine for theirs, mine in pairs)
-            label = f"{ours.replace('-', ' ')} against {name.replace('-', ' ')} ({work.split(', ')[0]})"
-            ratio = f"{median:.2f} ({first:.2f} to {third:.2f})"
-            yield [label, views, str(entry["threads"]), ratio, f"{goal}", f"{beyond}"]
+            peer, in_float32 = (fastest(contenders, kind, views) for kind in (dtype, "float32"))
+            if peer is not None:
+                median, cells = compared(entry, ours, views, peer)
+                yield [*cells, f"{goal} ({beyond})", reached(median, goal, beyond)]
+            if dtype != "float32" and peer is not None and in_float32 is not None and in_float32 < peer:
+                yield [*compared(entry, ours, views, in_float32)[1], "", ""]
+
+
+def compared(entry: Results, ours: str, views: str, peer: tuple[float, str, str]) -> tuple[float, list[str]]:
+    """How many times as fast as a peer: the median, and the first cells of the row."""
+    _, name, work = peer
+    contenders = entry["contenders"]
+    pairs = zip(contenders[name][work]["seconds"], contenders[ours][views]["seconds"], strict=True)
+    first, median, third = quartiles(theirs / own for theirs, own in pairs)
+    label = f"{ours.replace('-', ' ')} against {name.replace('-', ' ')} ({work.split(', ')[0]})"
+    return median, [label, views, str(entry["threads"]), f"{median:.2f} ({first:.2f} to {third:.2f})"]
+
+
+def fastest(contenders: Results, dtype: str, views: str) -> tuple[float, str, str] | None:
+    """The median, the name and the work of transformers' fastest correct setting, or None."""
+    return min(
+        (
+            (statistics.median(measured["seconds"]), name, work)
+            for name in (f"transformers-{dtype}", f"compiled-{dtype}")
+            if "failed" not in contenders.get(name, {"failed": ""})
+            for work, measured in contenders[name].items()
+            if work.split(", ")[-1] == views and is_correct(name, measured)
+        ),
+        default=None,
+    )
 
 
 def unchanged(results: Results) -> Iterator[str]:
     """Time and share of a full step of each kind of step."""
-    yield f"### {name_of(results)}"
+    yield f"### {name_of(results)}, unchanged views"
     rows = []
     for entry in results["reuse"]:
         full = entry["seconds"]["full step"]
@@ -213,7 +243,7 @@ def unchanged(results: Results) -> Iterator[str]:
 
 def loading(results: Results) -> Iterator[str]:
     """Peaks of memory, and cold loads against reading the files."""
-    yield f"### {name_of(results)}"
+    yield f"### {name_of(results)}, memory and loading"
     rows = []
     for entry in results["memory"]:
         runs = entry["runs"]
@@ -240,7 +270,7 @@ def loading(results: Results) -> Iterator[str]:
 
 def errors(results: Results) -> Iterator[str]:
     """Errors against float64."""
-    yield f"### {name_of(results)}"
+    yield f"### {name_of(results)}, errors"
     rows = []
     for entry in results["accuracy"]:
         layers = "" if entry["layers"] is None else f", {entry['layers'][0]} + {entry['layers'][1]} layers"
@@ -264,11 +294,12 @@ def spread(seconds: list[float]) -> str:
 SECTIONS: dict[str, tuple[str, str, Callable[[Results], Iterator[str]]]] = {
     "speed": (
         "Speed",
-        "The backbone alone: pixels and token ids in, features out, the prompt `open the drawer`. "
-        "transformers is SigLIP, a linear layer and Qwen3 with 12 layers, without logits, pooling head and "
-        "cache, all tensors in the named dtype. The floor is the longer of two times: the multiply-adds at "
-        "the peak of the arithmetic, measured in the same rounds, and the weights at the memory's bandwidth. "
-        "The error is the largest difference from the reference in float32, relative to the largest feature.",
+        "The backbone alone: pixels and token ids in, features out, the prompt `open the drawer`. Times "
+        "are medians with quartiles. transformers is SigLIP, a linear layer and Qwen3 with 12 layers, "
+        "without logits, pooling head and cache, all tensors in the named dtype. The floor is the longer "
+        "of two times: the multiply-adds at the peak of the arithmetic, measured in the same rounds, and "
+        "the weights at the memory's bandwidth. The error is the largest difference from the reference in "
+        "float32, relative to the largest feature.",
         speed,
     ),
     "reuse": (
@@ -282,7 +313,8 @@ SECTIONS: dict[str, tuple[str, str, Callable[[Results], Iterator[str]]]] = {
         "Peak memory of the process (`VmHWM`) in 10^9 bytes, and seconds of loading with the page cache "
         "dropped, against reading all tensor files. The policy holds one embodiment. Targets: "
         + ", ".join(f"{precision} at most {goal} GB" for precision, goal in memory.GOALS.items())
-        + f" loaded, and a load of at most {memory.LOAD_GOAL} times the reading.",
+        + f" loaded, and a load of at most {memory.LOAD_GOAL} times the reading. The host of a virtual "
+        "machine may hold the files in its own memory: rows whose reading differs are not comparable.",
         loading,
     ),
     "accuracy": (

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 import statistics
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -42,11 +42,8 @@ class Results:
         an engine, or that were timed in another way, are set aside under another name: no table mixes them.
         Whether there were any.
         """
-        before = self.data["machine"]
-        same = ("cpu", "build", "versions", "timing")
-        other = bool(before) and any(before.get(key) != machine.get(key) for key in same)
+        other = set_aside(self.path, self.data["machine"], machine)
         if other:
-            self.path.replace(self.path.with_name(f"{self.path.stem}-{before['build']}{self.path.suffix}"))
             self.data = {"format": FORMAT, "machine": {}, "peaks": [], "linear": [], "records": []}
         self.data["machine"] = machine
         return other
@@ -154,6 +151,29 @@ class Results:
         ]
         known = [value for value in values if value]
         return statistics.median(known) if known else None
+
+
+def set_aside(path: Path, before: Mapping[str, Any], now: Mapping[str, Any]) -> bool:
+    """Gives the file of measurements another name if they are of another machine than `now`.
+
+    Measurements of another CPU, build or version of an engine, or that were timed in another way, are not
+    mixed with new ones; nor are those of uncommitted changes, whose commit would be forgotten.
+
+    Args:
+        path: The file.
+        before: The machine of its measurements; empty if there are none.
+        now: The machine of what is measured from now on.
+
+    Returns:
+        Whether they are.
+    """
+    same = ["cpu", "build", "versions", "timing"]
+    if str(before.get("commit")).endswith("-dirty"):
+        same.append("commit")
+    other = bool(before) and any(before.get(key) != now.get(key) for key in same)
+    if other:
+        path.replace(path.with_name(f"{path.stem}-{before['build']}{path.suffix}"))
+    return other
 
 
 def slug(cpu: str) -> str:

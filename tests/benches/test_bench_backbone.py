@@ -17,6 +17,7 @@ from benches.backbone import __main__ as program
 from benches.backbone import accuracy, memory, peer, report, setup
 from benches.backbone.work import backbone_work, floor_seconds
 from benches.pages.report import UncommittedError
+from benches.peers.results import set_aside, slug
 from benches.work import total
 from saccade_lab import random_checkpoint
 from saccade_lab.backbone_sizes import BackboneSizes
@@ -24,6 +25,8 @@ from saccade_lab.reference import Backbone
 from saccade_lab.timing import Machine
 
 PUBLISHED = BackboneSizes.from_config({"kind": "n1.5 backbone"})
+
+COMMITTED = report.RECORDS
 
 torch.set_num_threads(1)
 
@@ -159,10 +162,8 @@ def test_the_page(checkpoint: Path) -> None:
     }
     page = report.page([results])
     # The wrong setting of transformers is faster and is not the one that is compared with.
-    assert (
-        "| saccade bfloat16 against transformers bfloat16 (sdpa) | 1 | 2 | 2.00 (2.00 to 2.00) | 1.3 | 1.8 |"
-        in page
-    )
+    against = "saccade bfloat16 against transformers bfloat16 (sdpa)"
+    assert f"| {against} | 1 | 2 | 2.00 (2.00 to 2.00) | 1.3 (1.8) | exceeded |" in page
     assert "5e-01, wrong" in page
     assert "saccade-int8 failed: no reason." in page
     assert "| int8, 2 threads | 1000 (1000 to 1000) | 600 (60 %) | 900 (90 %) | 200 (20 %) |" in page
@@ -170,37 +171,98 @@ def test_the_page(checkpoint: Path) -> None:
     assert "| plain | saccade int8 | 1.0e-02 | 2.0e-02 | 3.0e-02 |" in page
 
 
-def test_every_machine_keeps_a_record_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    record = json.loads((report.RECORDS / "zen-4.json").read_text())
-    measured, records, page = (tmp_path / name for name in ("results.json", "records", "page.md"))
-    records.mkdir()
-    monkeypatch.setattr(report, "RECORDS", records)
-    monkeypatch.setattr(report, "PAGE", page)
-    with pytest.raises(SystemExit, match="nothing measured yet"):
-        report.report(measured, write=True)
-    for name in ("Zen 5", "Zen 4", "Zen 4"):
-        record["machine"]["name"] = name
-        measured.write_text(json.dumps(record))
-        assert report.report(measured, write=True) == 0
-    assert sorted(path.name for path in records.iterdir()) == ["zen-4.json", "zen-5.json"]
-    written = page.read_text()
+@pytest.fixture
+def records(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder of records, empty, and a page beside it."""
+    folder = tmp_path / "records"
+    folder.mkdir()
+    monkeypatch.setattr(report, "RECORDS", folder)
+    monkeypatch.setattr(report, "PAGE", tmp_path / "page.md")
+    return folder
+
+
+def measured_on(cpu: str, commit: str = "0123abc") -> dict[str, Any]:
+    """The committed measurements of Zen 4, as if they were of another CPU."""
+    results: dict[str, Any] = json.loads((COMMITTED / "zen-4.json").read_text())
+    results["machine"] |= {"name": cpu, "commit": commit}
+    return results
+
+
+def test_every_machine_keeps_a_record_of_its_own(records: Path) -> None:
+    for cpu, commit in (("Zen 5", "1111111"), ("Zen 4", "2222222"), ("Zen 4", "3333333")):
+        kept = report.keep(measured_on(cpu, commit), Path("measured.json"))
+        assert kept == records / f"zen-{cpu[-1]}.json"
+        assert json.loads(kept.read_text())["machine"]["commit"] == commit
+    assert len(list(records.iterdir())) == 2
+    assert report.report(write=True) == 0
+    written = report.PAGE.read_text()
     assert written.count("The backbone alone") == 1
     assert written.index("### Zen 4, 2 threads") < written.index("### Zen 5, 2 threads")
+    assert "commit 2222222" not in written
 
-    record["machine"]["commit"] += "-dirty"
-    measured.write_text(json.dumps(record))
+
+def test_no_record_is_lost(records: Path) -> None:
+    before = measured_on("Zen 4") | {"memory": [], "accuracy": []}
+    kept = report.keep(before, Path("measured.json"))
+    held = kept.read_bytes()
+    for wrong, said in (
+        (measured_on("Zen 4"), "memory, accuracy, which measured.json lacks"),
+        (before | {"machine": before["machine"] | {"commit": "0123abc-dirty"}}, "0123abc-dirty"),
+    ):
+        with pytest.raises(SystemExit, match=said):
+            report.keep(wrong, Path("measured.json"))
+        assert kept.read_bytes() == held
+
+
+def test_no_page_of_uncommitted_changes(records: Path) -> None:
+    (records / "zen-4.json").write_text(json.dumps(measured_on("Zen 4", "0123abc-dirty")))
     with pytest.raises(UncommittedError):
-        report.report(measured, write=True)
-    assert page.read_text() == written
+        report.report(write=True)
+    assert not report.PAGE.exists()
 
 
-def test_the_page_is_that_of_the_committed_records(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
-    report.report(tmp_path / "nothing.json", write=False)
+def test_the_page_is_that_of_the_committed_records(capsys: pytest.CaptureFixture[str]) -> None:
+    report.report(write=False)
     assert capsys.readouterr().out == report.PAGE.read_text()
+    for path in COMMITTED.iterdir():
+        assert path.name == f"{slug(json.loads(path.read_text())['machine']['name'])}.json"
+
+
+def test_float32_of_transformers_is_compared_with_where_it_is_faster() -> None:
+    contenders = {
+        "saccade-int8": {"1": {"error": 1e-3, "seconds": [1.0]}},
+        "transformers-bfloat16": {"sdpa, 1": {"error": 1e-3, "seconds": [6.0]}},
+        "transformers-float32": {"sdpa, 1": {"error": 1e-6, "seconds": [2.0]}},
+    }
+    rows = list(report.goal_rows({"threads": 2, "contenders": contenders}))
+    assert [row[3:] for row in rows] == [
+        ["6.00 (6.00 to 6.00)", "2.5 (4.0)", "exceeded"],
+        ["2.00 (2.00 to 2.00)", "", ""],
+    ]
+    contenders["transformers-float32"]["sdpa, 1"]["seconds"] = [7.0]
+    assert len(list(report.goal_rows({"threads": 2, "contenders": contenders}))) == 1
+
+
+def test_measurements_of_another_build_are_set_aside(tmp_path: Path) -> None:
+    path, now = (
+        tmp_path / "results.json",
+        {"cpu": "a", "build": "1", "versions": {}, "timing": "", "commit": "2"},
+    )
+    for before, is_other in (
+        ({}, False),
+        (now, False),
+        (now | {"commit": "1"}, False),
+        (now | {"commit": "1-dirty"}, True),
+        (now | {"build": "0"}, True),
+        (now | {"cpu": "b"}, True),
+    ):
+        path.write_text("{}")
+        assert set_aside(path, before, now) == is_other
+        assert path.exists() != is_other
 
 
 def test_arguments() -> None:
-    assert program.parse([]).sections == list(program.SECTIONS)
+    assert program.parse([]).sections == list(report.SECTIONS)
     assert program.parse(["speed", "--threads", "1"]).threads == [1]
     for wrong in (["unknown"], ["report", "speed"], ["--rounds", "0"]):
         with pytest.raises(SystemExit):
