@@ -117,7 +117,8 @@ def lint(session: nox.Session) -> None:
     cargo(session, "clippy", *quiet, "--all-targets", "--", "--deny", "warnings")
     cargo(session, "doc", *quiet, "--no-deps", RUSTDOCFLAGS="--deny warnings")
     for feature in ("", "processor", "rewrite"):  # each alone; the workspace above has all of them
-        options = ("--package", "saccade-vla", "--no-default-features", "--features", feature)
+        options = ("--package", "saccade-vla", "--lib", "--examples", "--no-default-features")
+        options += ("--features", feature)
         cargo(session, "clippy", "--locked", "--quiet", *options, "--", "--deny", "warnings")
     deny = "cargo-deny --offline check licenses bans sources"
     for command in ("ruff check .", "ruff format --check .", "mypy", "stubtest saccade._saccade", deny):

@@ -10,7 +10,8 @@ The checkpoint is random, at N1.5's published size; it is written once, 4.8 GB. 
 a process of its own and they take turns: in a round each does every piece once, in an order that rotates.
 Before anything is timed, features are compared with the reference in float32. Run it on an idle machine with
 24 GB of memory; `accuracy` needs 12 GB for float64. A section that runs again replaces its results. At the
-end the results are copied to benches/backbone/results/ under the name of the CPU's family.
+end the results are copied to benches/backbone/results/ under the name of the CPU's family, if they are of a
+commit, of the usual sizes, and of all sections that the record there has.
 """
 
 from __future__ import annotations
@@ -45,18 +46,34 @@ def main(arguments: list[str] | None = None) -> int:
     results: Results = read_json(path, InputError) if path.exists() else {}
     machine_now = machine.describe()
     if set_aside(path, results.get("machine", {}), machine_now):
-        note(f"{path} is from another machine or build; it is set aside and measured again")
+        note(f"{path} is from another machine, commit or build; it is set aside and measured again")
         results = {}
     results["machine"] = machine_now
+    planned = results | dict.fromkeys(args.sections)
+    refusal = not_as_usual(args) or report.refusal(planned)
+    if refusal:
+        note(f"{refusal}: the results will not be kept in {report.RECORDS}")
     args.work.mkdir(parents=True, exist_ok=True)
     for section in args.sections:
         measured = {"speed": speed, "reuse": reuse_section, "memory": memory_section, "accuracy": errors}
         results[section] = measured[section](args)
         write_record(path, results)
     print(report.page([results]))
-    if not args.small:
-        print(report.keep(results, path))
+    if not refusal:
+        print(report.keep(results))
     return 0
+
+
+def not_as_usual(args: argparse.Namespace) -> str:
+    """What keeps the results from being a record, whose page says how they were measured; or nothing."""
+    usual = parse([])
+    names = [
+        name
+        for name in ("threads", "views", "layers", "checkpoint", "small")
+        if getattr(args, name) != getattr(usual, name)
+    ]
+    names += [name for name in ("rounds", "loads") if getattr(args, name) < getattr(usual, name)]
+    return f"not as usual: {', '.join(f'--{name}' for name in names)}" if names else ""
 
 
 def checkpoint(args: argparse.Namespace) -> Path:

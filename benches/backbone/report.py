@@ -29,35 +29,50 @@ GOALS = (
     ("saccade-float32", "float32", 1.2, 1.5),
 )
 
+MISSED = ", **missed**"
+"""Beside what is beyond its target."""
+
 Results = dict[str, Any]
 
 
-def keep(results: Results, path: Path) -> Path:
-    """Writes the measurements of `path` to the record of this CPU's family, and returns its file.
+def record_of(results: Results) -> Path:
+    """The record of this CPU's family."""
+    return RECORDS / f"{slug(name_of(results))}.json"
 
-    Raises:
-        UncommittedError: They are of a tree with uncommitted changes.
-        SystemExit: They lack a section of the record that they would replace.
-    """
-    require_commit(results, path)
-    kept = RECORDS / f"{slug(name_of(results))}.json"
+
+def refusal(results: Results) -> str:
+    """Why measurements with these sections do not become the record of their machine; or nothing."""
+    kept, commit = record_of(results), results["machine"]["commit"]
     before = json.loads(kept.read_text()) if kept.exists() else {}
     lost = [section for section in SECTIONS if section in before and section not in results]
     if lost:
-        raise SystemExit(
-            f"benches.backbone: {kept} has {', '.join(lost)}, which {path} lacks; measure that too"
-        )
-    write_record(kept, rounded(results))
-    return kept
+        return f"{kept.name} has {', '.join(lost)} too, which would be lost"
+    return f"{commit} is not a commit" if commit.endswith("-dirty") else ""
+
+
+def keep(results: Results) -> Path:
+    """Writes the record of this CPU's family, and returns its file.
+
+    Raises:
+        SystemExit: There is a `refusal`.
+    """
+    refused = refusal(results)
+    if refused:
+        raise SystemExit(f"benches.backbone: {refused}")
+    write_record(record_of(results), rounded(results))
+    return record_of(results)
 
 
 def report(*, write: bool) -> int:
     """Prints the page of the committed records, or writes it. Returns the exit status.
 
     Raises:
+        SystemExit: There are no records.
         UncommittedError: `write`, and a record is of a tree with uncommitted changes.
     """
     found = {path: json.loads(path.read_text()) for path in RECORDS.glob("*.json")}
+    if not found:
+        raise SystemExit("benches.backbone: nothing measured yet; run python -m benches.backbone")
     text = page(sorted(found.values(), key=name_of))
     if not write:
         print(text, end="")
@@ -73,7 +88,7 @@ def page(measured: Sequence[Results]) -> str:
     """The whole page: each section, with every machine that has it."""
     parts = [
         "# The backbone, measured",
-        "N1.5 at its published size with seeded random weights. Nothing else ran on the machines. "
+        "N1.5 at its published size with seeded random weights. The machines were otherwise idle. "
         "`python -m benches.backbone` measures a machine and keeps the numbers in "
         "`benches/backbone/results/`, one file per CPU family; `python -m benches.backbone report --write` "
         "writes this page from these files.",
@@ -184,10 +199,11 @@ def goal_rows(entry: Results) -> Iterator[list[str]]:
             continue
         for views in contenders[ours]:
             peer, in_float32 = (fastest(contenders, kind, views) for kind in (dtype, "float32"))
-            if peer is not None:
-                median, cells = compared(entry, ours, views, peer)
-                yield [*cells, f"{goal} ({beyond})", reached(median, goal, beyond)]
-            if dtype != "float32" and peer is not None and in_float32 is not None and in_float32 < peer:
+            if peer is None or not is_correct(ours, contenders[ours][views]):
+                continue
+            median, cells = compared(entry, ours, views, peer)
+            yield [*cells, f"{goal} ({beyond})", reached(median, goal, beyond)]
+            if in_float32 is not None and in_float32[0] < peer[0]:
                 yield [*compared(entry, ours, views, in_float32)[1], "", ""]
 
 
@@ -226,7 +242,8 @@ def unchanged(results: Results) -> Iterator[str]:
             seconds = entry["seconds"][piece]
             share = quartiles(part / whole for part, whole in zip(seconds, full, strict=True))[1]
             bits = "" if entry["same_bits"][piece] else ", other bits"
-            cells.append(f"{1e3 * statistics.median(seconds):.0f} ({100 * share:.0f} %{bits})")
+            missed = MISSED if share > reuse.GOALS.get(piece, 1.0) else ""
+            cells.append(f"{1e3 * statistics.median(seconds):.0f} ({100 * share:.0f} %{bits}){missed}")
         rows.append([f"{entry['precision']}, {plural(entry['threads'])}", *cells])
     rows.append(
         [
@@ -249,19 +266,22 @@ def loading(results: Results) -> Iterator[str]:
         runs = entry["runs"]
         held = runs[0]["nbytes"]
 
-        def peak(key: str, runs: list[Results] = runs) -> str:
-            return f"{max(run[key] for run in runs) / 1e9:.2f}"
-
+        before, loaded, called = (
+            max(run[key] for run in runs) / 1e9 for key in ("before", "loaded", "called")
+        )
+        most = memory.GOALS.get(entry["precision"]) if entry["what"] == "policy" else None
         load, read = ([run[key] for run in runs] for key in ("load", "read"))
         ratio = statistics.median(a / b for a, b in zip(load, read, strict=True))
         rows.append(
             [
                 f"{entry['what']}, {entry['precision']}",
                 "" if held is None else f"{held / 1e9:.2f}",
-                *(peak(key) for key in ("before", "loaded", "called")),
+                f"{before:.2f}",
+                f"{loaded:.2f}{MISSED if most is not None and loaded > most else ''}",
+                f"{called:.2f}",
                 f"{statistics.median(load):.1f}",
                 f"{statistics.median(read):.1f}",
-                f"{ratio:.2f}",
+                f"{ratio:.2f}{MISSED if ratio > memory.LOAD_GOAL else ''}",
             ]
         )
     head = ["", "held", "before", "loaded", "after a call", "load, s", "read, s", "load / read"]
@@ -314,7 +334,7 @@ SECTIONS: dict[str, tuple[str, str, Callable[[Results], Iterator[str]]]] = {
         "dropped, against reading all tensor files. The policy holds one embodiment. Targets: "
         + ", ".join(f"{precision} at most {goal} GB" for precision, goal in memory.GOALS.items())
         + f" loaded, and a load of at most {memory.LOAD_GOAL} times the reading. The host of a virtual "
-        "machine may hold the files in its own memory: rows whose reading differs are not comparable.",
+        "machine may hold the files in its own memory; they are then read faster than weights are packed.",
         loading,
     ),
     "accuracy": (

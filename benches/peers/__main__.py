@@ -63,7 +63,7 @@ def main(arguments: list[str] | None = None) -> int:
     machine_now = machine.describe()
     args.contenders = able(args.contenders, machine_now)
     if results.begin(machine_now):
-        note(f"{args.results} is from another machine or build; it is set aside and measured again")
+        note(f"{args.results} is from another machine, commit or build; it is set aside and measured again")
     measure_all(results, args)
     if not args.prepare:
         reporter.write(results, args.results.parent)

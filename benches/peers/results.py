@@ -38,9 +38,8 @@ class Results:
             raise SystemExit(f"bench-peers: {path} has format {self.data['format']}, expected {FORMAT}")
 
     def begin(self, machine: dict[str, Any]) -> bool:
-        """Names the machine of what is measured from now on. Measurements of another CPU, build or version of
-        an engine, or that were timed in another way, are set aside under another name: no table mixes them.
-        Whether there were any.
+        """Names the machine of what is measured from now on. Measurements that are not comparable are
+        `set_aside`: no table mixes them. Whether there were any.
         """
         other = set_aside(self.path, self.data["machine"], machine)
         if other:
@@ -156,8 +155,8 @@ class Results:
 def set_aside(path: Path, before: Mapping[str, Any], now: Mapping[str, Any]) -> bool:
     """Gives the file of measurements another name if they are of another machine than `now`.
 
-    Measurements of another CPU, build or version of an engine, or that were timed in another way, are not
-    mixed with new ones; nor are those of uncommitted changes, whose commit would be forgotten.
+    Measurements of another CPU, commit, build or version of an engine, or that were timed in another way, are
+    not mixed with new ones.
 
     Args:
         path: The file.
@@ -167,12 +166,11 @@ def set_aside(path: Path, before: Mapping[str, Any], now: Mapping[str, Any]) -> 
     Returns:
         Whether they are.
     """
-    same = ["cpu", "build", "versions", "timing"]
-    if str(before.get("commit")).endswith("-dirty"):
-        same.append("commit")
+    same = ("cpu", "build", "versions", "timing", "commit")
     other = bool(before) and any(before.get(key) != now.get(key) for key in same)
     if other:
-        path.replace(path.with_name(f"{path.stem}-{before['build']}{path.suffix}"))
+        number = sum(1 for _ in path.parent.glob(f"{path.stem}-{before['commit']}-*"))
+        path.replace(path.with_name(f"{path.stem}-{before['commit']}-{number}{path.suffix}"))
     return other
 
 

@@ -139,6 +139,34 @@ def test_options_that_do_not_fit_are_refused_before_images_are_encoded(
         policy.act(seen(policy), **options)
 
 
+def test_an_observation_that_does_not_fit_draws_nothing() -> None:
+    policy, generator = load("n17"), np.random.default_rng(0)
+    observation = seen(policy)
+    expected = policy.act(observation, seed=0)
+    short = {key: part[:, :1] for key, part in expected.items()}
+    with pytest.raises(ShapeError, match=r"^previous_chunk: "):
+        policy.act(observation, seed=generator, previous_chunk=short, chunking=saccade.Chunking(2, 1))
+    found = policy.act(observation, seed=generator)
+    assert all(np.array_equal(found[key], expected[key]) for key in expected)
+    again = policy.act(observation, seed=generator)  # the generator has advanced
+    assert any(not np.array_equal(again[key], expected[key]) for key in expected)
+
+
+def test_a_head_of_another_class_gets_the_seed() -> None:
+    policy = load("n17")
+    given: list[dict[str, Any]] = []
+
+    class OwnHead(saccade.ActionHead):
+        def sample(self, *args: Any, **options: Any) -> Any:
+            given.append(options)
+            return super().sample(*args, **options)
+
+    expected = policy.act(seen(policy), seed=7)
+    found = with_parts(policy, head=OwnHead.from_pretrained(whole("n17"))).act(seen(policy), seed=7)
+    assert given == [{"seed": 7}]
+    assert all(np.array_equal(found[key], expected[key]) for key in expected)
+
+
 def test_a_replaced_method_is_called(monkeypatch: pytest.MonkeyPatch) -> None:
     policy = with_parts(load("n16"), backbone=saccade.Backbone.from_pretrained(whole("n16")))
     called: list[int] = []

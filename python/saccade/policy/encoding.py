@@ -1,6 +1,6 @@
-"""Step 3 of :meth:`saccade.Policy.act`: the backbone's features, and the context of the action head.
+"""Step 4 of :meth:`saccade.Policy.act`: the backbone's features, and the context of the action head.
 
-If processor, backbone and head are saccade's own, steps 2 and 3 are one call of the engine.
+If processor, backbone and head are saccade's own, steps 3 and 4 are one call of the engine.
 """
 
 from __future__ import annotations

@@ -348,10 +348,6 @@ class Policy:
         if not is_observation(observation_or_state):
             return self._sample_state(context, observation_or_state, options)  # type: ignore[arg-type]
         batch = read_states(observation_or_state, self.requirements)  # type: ignore[arg-type]
-        if len(batch.state) != context.batch:
-            raise InputError(
-                f"observation: expected {context.batch}, as many as in context, got {len(batch.state)}"
-            )
         start = start_of_batch(batch, options, self.head, self.normalizer)
         actions = sample_from(start, context, self.head, self.embodiment_id)
         return restore_units(actions, batch, self.normalizer)

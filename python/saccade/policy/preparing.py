@@ -1,4 +1,4 @@
-"""Step 2 of :meth:`saccade.Policy.act`: frames and instructions as the inputs of the backbone."""
+"""Step 3 of :meth:`saccade.Policy.act`: frames and instructions as the inputs of the backbone."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Step 4 of :meth:`saccade.Policy.act`: sample normalised actions."""
+"""Steps 2 and 5 of :meth:`saccade.Policy.act`: what sampling starts from, and normalised actions."""
 
 from __future__ import annotations
 
@@ -43,33 +43,39 @@ class Sampling:
 
 @dataclass(frozen=True, eq=False)
 class Start:
-    """What sampling starts from: all of a call that does not depend on its context.
+    """What of sampling does not depend on the context.
 
     Attributes:
-        state: The normalised state, as the head takes it.
-        options: The options of the call, as the head takes them.
+        state: The normalised state.
+        options: The options of the call. The previous chunk is normalised. Noise is drawn if the state is of
+            observations and the head is saccade's own.
+        rows: Number of observations, or None for a state that was given as an array.
     """
 
     state: Array
     options: Sampling
+    rows: int | None = None
 
 
 def start_of_batch(batch: Batch[ParsedState], options: Sampling, head: Head, normalizer: Normalizer) -> Start:
     """The start of a call with parsed observations.
 
-    :meth:`saccade.Policy.act` takes it before it encodes the images: options that do not fit then cost no
-    time, and it is faster, because the kernels take the caches from the interpreter.
+    :meth:`saccade.Policy.act` calls it before it encodes images, so that a state, seed, number of samples or
+    previous chunk that does not fit is refused at once. It also takes less time while Python's code is in the
+    CPU's caches: 0.7 % of a call of the bundled policy on two threads of an Emerald Rapids.
     """
     if options.previous_chunk is not None:
         options = replace(options, previous_chunk=_joined_chunks(options.previous_chunk, batch, normalizer))
     if options.noise is not None and batch.is_single:
         axes = 3 if options.num_samples is None else 4
         options = replace(options, noise=_with_batch_axis(np.asarray(options.noise), axes, batch.parsed[0]))
+    start = start_of_state(batch.state, options, head, normalizer)
+    options, rows = start.options, len(batch.state)
     if is_own(head, ActionHead):  # others may draw in their own way
         samples = optional_integer("num_samples", options.num_samples)
-        noise = noise_or_draw(options.noise, options.seed, head.config, len(batch.state), samples)
+        noise = noise_or_draw(options.noise, options.seed, head.config, rows, samples)
         options = replace(options, noise=noise, seed=None)
-    return start_of_state(batch.state, options, head, normalizer)
+    return Start(start.state, options, rows)
 
 
 def start_of_state(state: ArrayLike, options: Sampling, head: Head, normalizer: Normalizer) -> Start:
@@ -81,6 +87,8 @@ def start_of_state(state: ArrayLike, options: Sampling, head: Head, normalizer: 
 
 def sample_from(start: Start, context: PolicyContext | Context, head: Head, embodiment_id: int) -> Array:
     """Normalised actions, as :meth:`saccade.ActionHead.sample` returns them."""
+    if start.rows not in (None, context.batch):
+        raise InputError(f"observation: expected {context.batch}, as many as in context, got {start.rows}")
     options = start.options
     if options.guidance is not None:
         options = replace(options, without=_second(context, head))

@@ -1,4 +1,4 @@
-"""Step 5 of :meth:`saccade.Policy.act`: actions in the robot's units and the observation's format."""
+"""Step 6 of :meth:`saccade.Policy.act`: actions in the robot's units and the observation's format."""
 
 from __future__ import annotations
 
