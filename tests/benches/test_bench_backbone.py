@@ -268,12 +268,12 @@ def test_a_target_is_missed_and_a_wrong_result_reaches_none() -> None:
 
 
 def test_measurements_of_another_machine_are_set_aside(tmp_path: Path) -> None:
-    now = {"cpu": "a", "build": "1", "versions": {}, "timing": "", "commit": "2"}
+    now: dict[str, Any] = {"cpu": "a", "build": "1", "versions": {}, "timing": "", "commit": "2"}
     path = tmp_path / "results.json"
     path.write_text("0")
     assert not set_aside(path, {}, now)
     assert not set_aside(path, now, now)
-    changes = (
+    changes: tuple[dict[str, Any], ...] = (
         {"cpu": "b"},
         {"build": "0"},
         {"versions": {"torch": "2"}},
